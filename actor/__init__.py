@@ -1,0 +1,1 @@
+"""Actors: the docking world, the rollout worker and evaluation."""

@@ -1,0 +1,1 @@
+"""The docking world in pybullet and its Gymnasium environment."""

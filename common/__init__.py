@@ -1,0 +1,1 @@
+"""What actors, learner and curriculum share: configuration, tasks, networks, messages and the bus."""

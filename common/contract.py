@@ -1,0 +1,79 @@
+"""The run's contract: what every actor, curriculum and learner of a run must agree on.
+
+The digest holds one short hash per field, so that a refusal can name the field that differs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from common.config import Config, differing_key, override, parse
+from common.errors import UsageError
+from common.messages import SCHEMA_VERSION, ContractReply, MessageError
+from common.networks import Encoder, load_state, make_encoder, state_of
+from common.observation import HISTORY
+
+
+def _short(value: Any) -> str:
+    data = value if isinstance(value, bytes) else json.dumps(value, sort_keys=True).encode()
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def digest(config: Config, encoder: bytes) -> dict[str, str]:
+    """Hashes of all that must agree, by field; `encoder` is the frozen encoder's weights."""
+    world = config.world.model_dump(mode="json")
+    settings = config.encoder.model_dump(mode="json")
+    return {
+        "protocol": str(SCHEMA_VERSION),
+        "encoder": _short(settings) if config.encoder.end_to_end else _short(encoder),
+        "observation": _short([world["camera"], world["lidar"], settings, HISTORY]),
+        "dynamics": _short([world[k] for k in ("robot", "dolly", "control_period", "substeps")]),
+        "reward": _short([world["reward"], world["max_episode_steps"]]),
+    }
+
+
+def check_digest(ours: dict[str, str], theirs: dict[str, str]) -> None:
+    """Raises MessageError naming the first field in which a sender differs from this run."""
+    for field, value in ours.items():
+        if theirs.get(field) != value:
+            raise MessageError(
+                f"contract differs in {field!r}: this run has {value}, got {theirs.get(field)}"
+            )
+
+
+def make_contract(run: str, config: Config) -> ContractReply:
+    """The contract of a new run."""
+    weights = save_tensors(state_of(encoder=make_encoder(config)))
+    return ContractReply(run=run, config=config.to_toml(), encoder=weights, digest=digest(config, weights))
+
+
+def contract_encoder(contract: ContractReply, config: Config) -> Encoder:
+    """The encoder with the contract's weights; raises UsageError when they do not fit `config`."""
+    encoder = make_encoder(config)
+    try:
+        load_state(load_tensors(contract.encoder), encoder=encoder)
+    except Exception as error:  # safetensors raises its own class without exporting a common base
+        raise UsageError(f"the run's encoder does not fit: {error}") from None
+    return encoder
+
+
+def accept_contract(contract: ContractReply, overrides: tuple[str, ...] = ()) -> Config:
+    """The configuration to work with: the run's, with local overrides that do not touch the contract.
+
+    Raises UsageError naming the field, and the key within it, when an override (or another version of the
+    code) would make this process differ from the run.
+    """
+    theirs = parse(contract.config)
+    ours = override(theirs.model_dump(mode="json"), overrides)
+    mine = digest(ours, contract.encoder)
+    for field, value in contract.digest.items():
+        if mine.get(field) != value:
+            found = differing_key(ours, theirs)
+            detail = f": {found[0]} is {found[1]} here and {found[2]} there" if found else ""
+            raise UsageError(f"refused by run {contract.run!r}: {field} differs{detail}")
+    return ours

@@ -1,0 +1,93 @@
+"""Plane geometry: rigid motions SE(2) and oriented rectangles, as pure functions.
+
+Frame of a cell: x to the right, y ahead (the dolly's axis), yaw counter-clockwise from +y, so that yaw 0
+looks along +y and yaw -90 deg looks at the right-hand wall (paper, appendix B). A body's own frame is the
+same: x to its right, y forward.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SE2:
+    """A pose in the plane: position x, y in m and yaw in rad. `a @ b` composes, `a.inverse()` inverts."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+
+    def __matmul__(self, other: SE2) -> SE2:
+        x, y = self.apply(other.x, other.y)
+        return SE2(x, y, wrap(self.yaw + other.yaw))
+
+    def apply(self, x: float, y: float) -> tuple[float, float]:
+        """A point of the body's frame (m), in the frame that the pose is given in (m)."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return self.x + c * x - s * y, self.y + s * x + c * y
+
+    def inverse(self) -> SE2:
+        """The pose p with p @ self == identity."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return SE2(-c * self.x - s * self.y, s * self.x - c * self.y, wrap(-self.yaw))
+
+    @property
+    def forward(self) -> tuple[float, float]:
+        """Unit vector of the heading."""
+        return -math.sin(self.yaw), math.cos(self.yaw)
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """An oriented rectangle: pose of its centre, half extents along its own x and y (m)."""
+
+    pose: SE2
+    half_x: float
+    half_y: float
+
+    def corners(self) -> Array:
+        """(4, 2) corner positions, counter-clockwise."""
+        signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        return np.array([self.pose.apply(sx * self.half_x, sy * self.half_y) for sx, sy in signs])
+
+
+def wrap(angle: float) -> float:
+    """The angle in (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2 * math.pi)
+
+
+def bearing(origin: SE2, x: float, y: float) -> float:
+    """Signed angle (rad) from the heading of `origin` to the point, positive to the left."""
+    fx, fy = origin.forward
+    dx, dy = x - origin.x, y - origin.y
+    return math.atan2(fx * dy - fy * dx, fx * dx + fy * dy)
+
+
+def distance_to_rectangle(x: float, y: float, rectangle: Rectangle) -> float:
+    """Distance (m) from a point to the nearest point of a rectangle; 0 inside it."""
+    local = rectangle.pose.inverse().apply(x, y)
+    dx = max(abs(local[0]) - rectangle.half_x, 0.0)
+    dy = max(abs(local[1]) - rectangle.half_y, 0.0)
+    return math.hypot(dx, dy)
+
+
+def rectangles_overlap(a: Rectangle, b: Rectangle, margin: float = 0.0) -> bool:
+    """Whether two oriented rectangles, `a` grown by `margin` (m) on every side, share a point.
+
+    Separating axes: convex shapes are apart exactly when their projections on the normal of some edge are.
+    """
+    grown = Rectangle(a.pose, a.half_x + margin, a.half_y + margin)
+    pa, pb = grown.corners(), b.corners()
+    for yaw in (a.pose.yaw, a.pose.yaw + math.pi / 2, b.pose.yaw, b.pose.yaw + math.pi / 2):
+        axis = np.array([math.cos(yaw), math.sin(yaw)])
+        qa, qb = pa @ axis, pb @ axis
+        if qa.max() < qb.min() or qb.max() < qa.min():
+            return False
+    return True

@@ -1,0 +1,283 @@
+"""Every message on the wire and in the log: typed, versioned, bounded, without pickle.
+
+A message is msgpack of [schema version, type name, fields]. An array is [dtype, shape, raw bytes in C order].
+Nothing is trusted on arrival: size, version, type, every field, dtype, shape and finiteness are checked, and
+`MessageError` says which of them failed.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+
+from common.observation import ACTION_SIZE, Columns, ObservationLayout
+from common.tasks import CELLS, GeometricProperties, Task
+
+SCHEMA_VERSION = 1
+MEGABYTE = 2**20
+
+Ending = Literal["success", "dolly_contact", "other_contact", "timeout"]
+ENDINGS: tuple[Ending, ...] = ("success", "dolly_contact", "other_contact", "timeout")
+Requested = Literal["easy", "frontier", "random"]
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
+CellIndex = Annotated[int, Field(ge=0, lt=len(CELLS))]
+NonNegative = Annotated[int, Field(ge=0)]
+
+
+class MessageError(ValueError):
+    """A message that was refused; the text is the reason, safe to send back."""
+
+
+def _to_array(value: Any) -> NDArray[Any]:
+    if isinstance(value, np.ndarray):
+        return value
+    if not (isinstance(value, list) and len(value) == 3 and isinstance(value[2], bytes)):
+        raise ValueError("an array is [dtype, shape, bytes]")
+    dtype, shape, raw = value
+    if dtype not in ("float16", "float32", "float64", "uint8"):
+        raise ValueError(f"dtype {dtype!r} is not allowed")
+    if not (isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape) and len(shape) <= 5):
+        raise ValueError("a shape is a list of at most five non-negative integers")
+    count = 1
+    for n in shape:
+        count *= n
+    if count * np.dtype(dtype).itemsize != len(raw):
+        raise ValueError(f"{len(raw)} bytes do not hold {dtype} of shape {shape}")
+    array = np.frombuffer(raw, dtype).reshape(shape)
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError("an array holds NaN or infinity")
+    return array
+
+
+def _from_array(array: NDArray[Any]) -> list[Any]:
+    return [array.dtype.name, list(array.shape), array.tobytes()]
+
+
+WireArray = Annotated[np.ndarray, BeforeValidator(_to_array), PlainSerializer(_from_array)]
+
+
+class Message(BaseModel):
+    """Base of all messages; `max_bytes` bounds the encoded size."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    max_bytes: ClassVar[int] = MEGABYTE
+
+
+class Origin(Message):
+    """Who made a message, once and for all: retries carry the same one, so that duplicates are recognised."""
+
+    actor: Name
+    boot: Name
+    """Fresh for every incarnation of the process."""
+    seq: NonNegative
+
+
+class Version(Message):
+    """Version of the weights: the learner's incarnation and its update count; compared in that order."""
+
+    epoch: NonNegative = 0
+    counter: NonNegative = 0
+
+    def __lt__(self, other: Version) -> bool:
+        return (self.epoch, self.counter) < (other.epoch, other.counter)
+
+
+Digest = Annotated[dict[str, str], Field(max_length=16)]
+"""Short hashes of everything that must agree, by field; see common/contract.py."""
+
+
+class Episode(Message):
+    """A finished episode: T transitions in T + 1 rows (see common/observation.py)."""
+
+    max_bytes: ClassVar[int] = 64 * MEGABYTE
+
+    digest: Digest
+    task: Task
+    visual: WireArray
+    lidar: WireArray
+    action: WireArray
+    reward: WireArray
+    ending: Ending
+    first_version: Version
+    last_version: Version
+    category: Annotated[str, Field(max_length=32)]
+    """Why the task was proposed: the curriculum's category, or `unserved` without an answer from it."""
+
+    @property
+    def length(self) -> int:
+        """T, the number of transitions."""
+        return len(self.reward) - 1
+
+    @property
+    def truncated(self) -> bool:
+        """True when the episode ran out of time: its last step bootstraps."""
+        return self.ending == "timeout"
+
+    def columns(self) -> Columns:
+        """The rows."""
+        return Columns(self.visual, self.lidar, self.action, self.reward)
+
+    def check_layout(self, layout: ObservationLayout, max_steps: int) -> None:
+        """Raises MessageError unless the rows are those of the layout."""
+        rows = len(self.reward)
+        if not 2 <= rows <= max_steps + 1:
+            raise MessageError(f"episode of {rows - 1} steps; 1 to {max_steps} are possible")
+        expected = {
+            "visual": ((rows, *layout.row_shape), layout.row_dtype),
+            "lidar": ((rows, layout.lidar), "float16"),
+            "action": ((rows, ACTION_SIZE), "float32"),
+            "reward": ((rows,), "float32"),
+        }
+        for name, (shape, dtype) in expected.items():
+            array: NDArray[Any] = getattr(self, name)
+            if array.shape != shape or array.dtype != dtype:
+                raise MessageError(f"{name} is {array.dtype} {array.shape}, expected {dtype} {shape}")
+        if np.abs(self.action).max() > 1.0:
+            raise MessageError("action outside [-1, 1]")
+
+
+class TaskQuery(Message):
+    """An actor (or anybody) asks for tasks."""
+
+    cell: CellIndex
+    t: NonNegative = 0
+    """The asking world's own environment steps so far."""
+    count: Annotated[int, Field(ge=1, le=1000)] = 1
+
+
+class Proposal(Message):
+    """One proposed task with everything that led to it."""
+
+    id: Name
+    task: Task
+    requested: Requested
+    category: Annotated[str, Field(max_length=32)]
+    """What was found: the requested type, `random` when n_T draws met nothing, `gate`, `rnd`."""
+    properties: GeometricProperties
+    q: float | None
+    q_reason: str
+    f: float | None
+    mu: float | None
+    sigma: float | None
+    robot: tuple[float, float, float]
+    dolly: tuple[float, float, float]
+
+
+class Proposals(Message):
+    """The answer to a TaskQuery."""
+
+    tasks: list[Proposal]
+
+
+class Outcome(Message):
+    """How a proposed task ended, for f_pi; `proposal` makes it idempotent."""
+
+    digest: Digest
+    proposal: Name
+    task: Task
+    properties: GeometricProperties
+    q: float | None
+    success: bool
+    category: Annotated[str, Field(max_length=32)]
+
+
+class Candidate(Message):
+    """A start that an actor has rendered and encoded: one observation row, stacked by replication."""
+
+    task: Task
+    visual: WireArray
+    lidar: WireArray
+
+
+class Candidates(Message):
+    """New candidate starts for the task database."""
+
+    max_bytes: ClassVar[int] = 16 * MEGABYTE
+
+    digest: Digest
+    candidates: Annotated[list[Candidate], Field(max_length=1000)]
+
+
+class WeightsBlob(Message):
+    """Tensors in safetensors format with their checksum; see common/weights.py."""
+
+    max_bytes: ClassVar[int] = 256 * MEGABYTE
+
+    version: Version
+    sha256: str
+    blob: bytes
+
+
+class ContractReply(Message):
+    """What a newcomer must know of a run; see common/contract.py."""
+
+    max_bytes: ClassVar[int] = 64 * MEGABYTE
+
+    run: Name
+    config: str
+    """The resolved configuration, TOML."""
+    encoder: bytes
+    """Weights of the frozen encoder, safetensors."""
+    digest: Digest
+
+
+class Stat(Message):
+    """A process's figures for the live screen, about once a second."""
+
+    role: Name
+    id: Name
+    host: Annotated[str, Field(max_length=128)]
+    pid: NonNegative
+    values: Annotated[dict[str, float | int | str], Field(max_length=64)]
+
+
+class Acknowledgement(Message):
+    """The receiver has it for good."""
+
+    duplicate: bool = False
+
+
+class Nothing(Message):
+    """An empty question."""
+
+
+M = TypeVar("M", bound=Message)
+
+
+def encode(message: Message) -> bytes:
+    """The message as bytes; raises MessageError when it is larger than its type allows."""
+    fields = message.model_dump(mode="python")
+    data: bytes = msgpack.packb([SCHEMA_VERSION, type(message).__name__, fields], use_bin_type=True)
+    _check_size(type(message), len(data))
+    return data
+
+
+def decode(kind: type[M], data: bytes) -> M:
+    """The message of that type in `data`; raises MessageError with the reason."""
+    _check_size(kind, len(data))
+    try:
+        outer = msgpack.unpackb(data, raw=False, strict_map_key=True)
+    except Exception as error:  # msgpack raises half a dozen kinds, each of which means the same here
+        raise MessageError(f"not msgpack: {type(error).__name__}") from None
+    if not (isinstance(outer, list) and len(outer) == 3):
+        raise MessageError("a message is [version, type, fields]")
+    version, name, fields = outer
+    if version != SCHEMA_VERSION:
+        raise MessageError(f"schema version {version!r}, this side speaks {SCHEMA_VERSION}")
+    if name != kind.__name__:
+        raise MessageError(f"message of type {str(name)[:40]!r} where {kind.__name__} is expected")
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        path = ".".join(str(part) for part in first["loc"])[:80]
+        raise MessageError(f"{name}.{path}: {first['msg'][:160]}") from None
+
+
+def _check_size(kind: type[Message], size: int) -> None:
+    if size > kind.max_bytes:
+        raise MessageError(f"{kind.__name__} of {size} bytes; at most {kind.max_bytes} are allowed")

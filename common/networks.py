@@ -1,0 +1,230 @@
+"""The networks: image encoder, sensor fusion, policy and critic (figures of the network and ResNet blocks)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from common.config import Config, EncoderConfig, NetworkConfig
+from common.observation import ACTION_SIZE, Observation, ObservationLayout
+
+LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
+
+
+class ConcatBlock(nn.Module):
+    """Two 3x3 convolutions, the identity concatenated, a 2x2 stride-2 convolution (appendix A)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.down = nn.Conv2d(outputs + inputs, outputs, 2, stride=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, S, S) -> (B, outputs, S / 2, S / 2)."""
+        y = F.relu(self.second(F.relu(self.first(x))))
+        return F.relu(self.down(torch.cat([y, x], dim=1)))
+
+
+class LightBlock(nn.Module):
+    """A 3x3 stride-2 convolution and a residual 3x3 convolution."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.down = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1)
+        self.residual = nn.Conv2d(outputs, outputs, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, S, S) -> (B, outputs, S / 2, S / 2)."""
+        y = F.relu(self.down(x))
+        return F.relu(y + self.residual(y))
+
+
+class Encoder(nn.Module):
+    """Images to codes: four halvings, flattened; a code has (size / 16)^2 * channels[-1] features."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        sizes = (3 * config.frames_per_code, *config.channels)
+        blocks: list[nn.Module]
+        if config.kind == "residual":
+            blocks = [ConcatBlock(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        else:
+            stem = nn.Sequential(nn.Conv2d(sizes[0], sizes[1], 4, stride=2, padding=1), nn.ReLU())
+            blocks = [stem, *(LightBlock(a, b) for a, b in zip(sizes[1:-1], sizes[2:], strict=True))]
+        self.blocks = nn.Sequential(*blocks)
+        self.frames_per_code = config.frames_per_code
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """(B, 3 * frames_per_code, S, S) float32 in [0, 1] -> (B, code) float32."""
+        return torch.flatten(self.blocks(frames), 1)
+
+    def encode_stacks(self, frames: Tensor) -> Tensor:
+        """(B, 4, S, S, 3) uint8 -> (B, codes * code) float32, for training end to end."""
+        b, n, s = frames.shape[:3]
+        grouped = frames.reshape(b * n // self.frames_per_code, self.frames_per_code, s, s, 3)
+        return self(_to_channels(grouped)).reshape(b, -1)
+
+
+def _to_channels(frames: Tensor) -> Tensor:
+    """(B, F, S, S, 3) uint8 -> (B, 3 F, S, S) float32 in [0, 1]."""
+    b, f, s = frames.shape[:3]
+    return frames.permute(0, 1, 4, 2, 3).reshape(b, 3 * f, s, s).float() / 255.0
+
+
+def make_encoder(config: Config) -> Encoder:
+    """The encoder at its seeded initialisation."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return Encoder(config.encoder)
+
+
+def compile_encoder(encoder: Encoder, image_size: int) -> Callable[[NDArray[np.uint8]], NDArray[np.float16]]:
+    """A frozen encoder as an ONNX Runtime function on one thread.
+
+    Takes (B, frames_per_code, S, S, 3) uint8, returns the codes (B, code) float16.
+    """
+    import onnxruntime  # heavy, and only processes that encode need it
+
+    channels = 3 * encoder.frames_per_code
+    graph = BytesIO()
+    torch.onnx.export(
+        encoder.eval(),
+        (torch.zeros(1, channels, image_size, image_size),),
+        graph,
+        dynamo=False,  # the other exporter needs onnxscript, for the same graph
+        input_names=["frames"],
+        output_names=["code"],
+        dynamic_axes={"frames": {0: "batch"}, "code": {0: "batch"}},
+    )
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(graph.getvalue(), options, providers=["CPUExecutionProvider"])
+
+    def encode(frames: NDArray[np.uint8]) -> NDArray[np.float16]:
+        images = _to_channels(torch.from_numpy(frames)).numpy()
+        codes: NDArray[np.float32] = session.run(None, {"frames": images})[0]
+        return codes.astype(np.float16)
+
+    return encode
+
+
+def _mlp(sizes: tuple[int, ...], layer_norm: bool = False) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(a, b), *([nn.LayerNorm(b)] if layer_norm else []), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+class FusionNetwork(nn.Module):
+    """Branches for LiDAR and history, concatenated with the visual code (and an action), then the head."""
+
+    def __init__(
+        self, layout: ObservationLayout, config: NetworkConfig, extra: int, outputs: int, layer_norm: bool
+    ) -> None:
+        super().__init__()
+        self.sizes = [layout.visual, layout.lidar, layout.history]
+        self.lidar_branch = _mlp((layout.lidar, *config.lidar_branch))
+        self.history_branch = _mlp((layout.history, *config.history_branch))
+        fused = layout.visual + (layout.lidar, *config.lidar_branch)[-1]
+        fused += (layout.history, *config.history_branch)[-1] + extra
+        self.head = _mlp((fused, *config.hidden), layer_norm)
+        self.output = nn.Linear(config.hidden[-1], outputs)
+
+    def forward(self, flat: Tensor, *extra: Tensor) -> Tensor:
+        """(B, layout.size), and (B, extra) if any -> (B, outputs)."""
+        visual, lidar, history = flat.split(self.sizes, dim=-1)
+        parts = (visual, self.lidar_branch(lidar), self.history_branch(history), *extra)
+        out: Tensor = self.output(self.head(torch.cat(parts, dim=-1)))
+        return out
+
+
+class Policy(nn.Module):
+    """Tanh-Gaussian policy (section 3.1): actions in [-1, 1]^2 are [v in m/s, w in rad/s]."""
+
+    def __init__(self, layout: ObservationLayout, config: NetworkConfig) -> None:
+        super().__init__()
+        self.net = FusionNetwork(layout, config, 0, 2 * ACTION_SIZE, layer_norm=False)
+
+    def forward(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, layout.size) -> mean and log standard deviation before the tanh, (B, 2) each."""
+        mean, log_std = self.net(flat).chunk(2, dim=-1)
+        half = (LOG_STD_MAX - LOG_STD_MIN) / 2
+        return mean, LOG_STD_MIN + half * (torch.tanh(log_std) + 1)
+
+    def mode(self, flat: Tensor) -> Tensor:
+        """The greedy action tanh(mean), (B, 2)."""
+        return torch.tanh(self(flat)[0])
+
+    def sample(self, flat: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Reparameterised action (B, 2) for standard normal `noise` (B, 2), and its log density (B,)."""
+        mean, log_std = self(flat)
+        raw = mean + log_std.exp() * noise
+        log_density = (-0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
+        # log(1 - tanh(raw)^2), written so that it does not underflow
+        log_jacobian = (2 * (np.log(2) - raw - F.softplus(-2 * raw))).sum(-1)
+        return torch.tanh(raw), log_density - log_jacobian
+
+
+class TwinCritic(nn.Module):
+    """Two critics Q(s, a); they differ from the policy in the output layer and the action input only."""
+
+    def __init__(self, layout: ObservationLayout, config: NetworkConfig) -> None:
+        super().__init__()
+        self.critics = nn.ModuleList(
+            FusionNetwork(layout, config, ACTION_SIZE, 1, config.layer_norm) for _ in range(2)
+        )
+
+    def forward(self, flat: Tensor, action: Tensor) -> Tensor:
+        """(B, layout.size), (B, 2) -> (2, B)."""
+        return torch.stack([critic(flat, action).squeeze(-1) for critic in self.critics])
+
+
+def flatten(observation: Observation, encoder: Encoder | None = None) -> Tensor:
+    """The vector [visual, lidar, actions, rewards] (B, layout.size) float32.
+
+    `visual` holds codes, or frames when an `encoder` that trains end to end is given.
+    """
+    visual = torch.from_numpy(observation.visual)
+    code = encoder.encode_stacks(visual) if encoder is not None else visual.flatten(1).float()
+    lidar, history = torch.from_numpy(observation.lidar).float(), torch.from_numpy(observation.history)
+    return torch.cat([code, lidar, history], dim=1)
+
+
+def initial_q(policy: Policy, critic: TwinCritic, flat: Tensor) -> NDArray[np.float64]:
+    """Q(s0, a0) of start observations (B, layout.size): minimum of the twin critics at the greedy action."""
+    with torch.no_grad():
+        return critic(flat, policy.mode(flat)).min(0).values.double().numpy()
+
+
+def state_of(**modules: nn.Module) -> dict[str, Tensor]:
+    """One flat dictionary of tensors, `name.parameter`."""
+    return {
+        f"{name}.{key}": value
+        for name, module in modules.items()
+        for key, value in module.state_dict().items()
+    }
+
+
+def load_state(tensors: dict[str, Any], **modules: nn.Module) -> None:
+    """Loads what `state_of` made; raises ValueError naming the first tensor that does not fit."""
+    for name, module in modules.items():
+        own = module.state_dict()
+        for key, value in own.items():
+            given = tensors.get(f"{name}.{key}")
+            if given is None or given.shape != value.shape:
+                found = "missing" if given is None else f"of shape {tuple(given.shape)}"
+                raise ValueError(f"tensor {name}.{key} is {found}, expected shape {tuple(value.shape)}")
+        module.load_state_dict({key: tensors[f"{name}.{key}"] for key in own})

@@ -1,0 +1,70 @@
+"""What processes tell about themselves: figures on the bus once a second, and logging to stderr."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import sys
+import time
+from types import FrameType
+
+import zenoh
+
+from common.bus import Keys, publish
+from common.messages import Stat
+
+
+class Reporter:
+    """Publishes a process's figures at most once a second."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, role: str, name: str) -> None:
+        self._session, self._key = session, keys.stat(role, name)
+        self._role, self._name = role, name
+        self._last = 0.0
+
+    @property
+    def due(self) -> bool:
+        """Whether a second has passed since the last report."""
+        return time.monotonic() - self._last >= 1.0
+
+    def report(self, values: dict[str, float | int | str]) -> None:
+        """Publishes the figures."""
+        self._last = time.monotonic()
+        stat = Stat(role=self._role, id=self._name, host=socket.gethostname(), pid=os.getpid(), values=values)
+        publish(self._session, self._key, stat)
+
+
+class Rate:
+    """Events per second, over the time between two readings."""
+
+    def __init__(self) -> None:
+        self._count, self._time, self._value = 0.0, time.monotonic(), 0.0
+
+    def read(self, count: float) -> float:
+        """The rate at which `count` has grown, renewed at most once a second."""
+        now = time.monotonic()
+        if now - self._time >= 1.0:
+            self._value = (count - self._count) / (now - self._time)
+            self._count, self._time = count, now
+        return self._value
+
+
+def start_logging(level: int = logging.INFO) -> None:
+    """Log lines on stderr."""
+    logging.basicConfig(
+        level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
+    )
+
+
+def exit_on_signals() -> None:
+    """Turns SIGTERM and SIGINT into SystemExit, so that sessions and files are closed on the way out."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        raise SystemExit(0)
+
+    signal.signal(signal.SIGTERM, leave)
+    signal.signal(signal.SIGINT, leave)

@@ -1,0 +1,1 @@
+"""The curriculum: NavACL-Q, its success network and the service that answers task queries."""

@@ -1,0 +1,1 @@
+"""The navaclq command, the local launcher and everything that deploys the processes."""

@@ -1,0 +1,1 @@
+"""The navaclq command, one module per command group."""

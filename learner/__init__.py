@@ -1,0 +1,1 @@
+"""The learner: replay, soft actor-critic, checkpoints and the process that owns them."""

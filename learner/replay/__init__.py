@@ -1,0 +1,1 @@
+"""Prioritised replay: columns, sum tree and the durable log of episodes."""
