@@ -17,7 +17,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 import zenoh
@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 BUSY = "BUSY"
+INTERNAL_ERROR = "internal error"
 LEASE_MS = 3000
 """A frozen or unreachable peer is given up after this."""
 
@@ -41,10 +42,13 @@ class Keys:
         self.trajectory = f"{self.root}/trajectory"
         self.contract = f"{self.root}/contract"
         self.version = f"{self.root}/weights/version"
-        self.weights = f"{self.root}/weights/latest"
         self.task = f"{self.root}/curriculum/task"
         self.result = f"{self.root}/curriculum/result"
         self.candidates = f"{self.root}/curriculum/candidates"
+
+    def weights(self, kind: str) -> str:
+        """Newest weights: `policy` for actors, `critic` (policy and critics) for the curriculum."""
+        return f"{self.root}/weights/latest/{kind}"
 
     def live(self, role: str, name: str) -> str:
         """Liveliness token of a process."""
@@ -146,7 +150,7 @@ class QueryServer:
         self, session: zenoh.Session, key: str, handler: Callable[[bytes, bytes], bytes], capacity: int = 256
     ) -> None:
         self.refused: Counter[str] = Counter()
-        self._handler = handler
+        self._key, self._handler = key, handler
         self._inbox: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
         self._logged = 0.0
         self._thread = threading.Thread(target=self._serve, name=f"serve {key}", daemon=True)
@@ -169,10 +173,10 @@ class QueryServer:
                 self._refuse(query, str(error))
             except Exception:
                 log.exception("error while answering %s", query.key_expr)
-                self._refuse(query, "internal error")
+                self._refuse(query, INTERNAL_ERROR)
             else:
                 with query:
-                    query.reply(query.key_expr, answer)
+                    query.reply(self._key, answer)  # the query's own expression may hold wildcards
             query = None  # an undropped query would hold its reply back until the timeout
 
     def _refuse(self, query: zenoh.Query, reason: str) -> None:
@@ -186,9 +190,10 @@ class QueryServer:
 
     def close(self) -> None:
         """Stops taking queries and ends the thread after those already taken."""
-        self._queryable.undeclare()
-        self._inbox.put(None)
-        self._thread.join(timeout=2.0)
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        with suppress(queue.Full):  # behind a handler that is stuck; its thread, a daemon, is abandoned
+            self._inbox.put(None, timeout=1.0)
+            self._thread.join(timeout=2.0)
 
 
 def serve(session: zenoh.Session, key: str, kind: type[M], handler: Callable[[M], Message]) -> QueryServer:
@@ -199,7 +204,7 @@ def serve(session: zenoh.Session, key: str, kind: type[M], handler: Callable[[M]
 def _read(reply: zenoh.Reply) -> bytes:
     if reply.ok is not None:
         return reply.ok.payload.to_bytes()
-    reason = reply.err.payload.to_string() if reply.err is not None else ""
+    reason = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else ""
     if reason == "Timeout":
         raise NoAnswerError("timeout")
     raise RefusedError(reason[:400])
@@ -235,7 +240,7 @@ def ask_later(
     answer: Callable[[M | None], None],
     timeout: float,
 ) -> None:
-    """Asks without waiting; `answer` is called once from Zenoh's thread, with None when nothing usable came."""
+    """Asks without waiting; `answer` is called once from Zenoh's thread, with None if nothing usable came."""
     found: list[M] = []
 
     def collect(reply: zenoh.Reply) -> None:

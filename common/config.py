@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -52,10 +53,10 @@ class StartRanges(Section):
 
     def narrowed(self, scale: float) -> StartRanges:
         """The ranges shrunk towards near and straight; scale in [0, 1], 1 leaves them as they are."""
-        near = self.distance_min + 0.5
+        near = min(self.distance_min + 0.5, self.distance_max)
         return StartRanges(
             distance_min=self.distance_min,
-            distance_max=max(self.distance_min, near + scale * (self.distance_max - near)),
+            distance_max=min(near + scale * (self.distance_max - near), self.distance_max),
             yaw=self.yaw * scale,
             bearing=self.bearing * scale,
             dolly_yaw=self.dolly_yaw * scale,
@@ -136,6 +137,12 @@ class ObstacleConfig(Section):
     count_max: Annotated[int, Field(ge=0, le=8)] = 4
     distance_min: Positive = 2.0
     distance_max: Positive = 5.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ObstacleConfig:
+        if self.count_min > self.count_max or self.distance_min > self.distance_max:
+            raise ValueError("count_min <= count_max and distance_min <= distance_max must hold")
+        return self
 
 
 class WorldConfig(Section):
@@ -275,11 +282,13 @@ class CurriculumConfig(Section):
     fit_steps: Count = 8
     """Gradient steps per batch of fresh outcomes."""
     fit_batch: Count = 64
-    """Outcomes per gradient step drawn from the reservoir; unused by `navacl-q`, which takes the fresh ones."""
+    """Outcomes per gradient step, from the reservoir; unused by `navacl-q`, which takes the fresh ones."""
     reservoir: Count = 1500
     random_limit: Fraction = 0.15
     """P(random) = min(random_limit, t / random_steps), t the asking actor's own steps (authors' code)."""
     random_steps: Positive = 20_000.0
+    easy_share: Fraction = 0.25
+    """Share of easy tasks among those that are not random; the authors' code has a half."""
     narrowed_candidates: Fraction = 0.5
     """Share of candidates drawn from narrowed ranges."""
     store_per_cell: Count = 1000
@@ -326,7 +335,7 @@ def resolve(
     if preset not in get_args(Preset):
         raise UsageError(f"preset {preset!r} does not exist; choose one of {', '.join(get_args(Preset))}")
     variant = variant or values.get("variant", "navacl-q")
-    if variant not in VARIANTS:
+    if variant not in get_args(Variant):
         raise UsageError(f"variant {variant!r} does not exist; choose one of {', '.join(VARIANTS)}")
     text = resources.files("common").joinpath("presets", f"{preset}.toml").read_text("utf-8")
     merged = _merge(_merge(tomllib.loads(text), VARIANTS[variant]), values)
@@ -378,20 +387,23 @@ def known_keys() -> list[str]:
     return walk(Config, "")
 
 
-def differing_key(ours: BaseModel, theirs: BaseModel) -> tuple[str, Any, Any] | None:
-    """The first dotted key whose values differ, with both values; None when all agree."""
-    a, b = ours.model_dump(), theirs.model_dump()
+def differing_key(
+    ours: BaseModel, theirs: BaseModel, within: tuple[str, ...] = ("",)
+) -> tuple[str, Any, Any] | None:
+    """The first dotted key, of those that begin with one of `within`, whose values differ, with both values.
 
-    def walk(x: Any, y: Any, path: str) -> tuple[str, Any, Any] | None:
+    None when all agree.
+    """
+
+    def walk(x: Any, y: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
         if isinstance(x, dict) and isinstance(y, dict):
             for key in x:
-                found = walk(x[key], y.get(key), f"{path}.{key}" if path else key)
-                if found:
-                    return found
-            return None
-        return None if x == y else (path, x, y)
+                yield from walk(x[key], y.get(key), f"{path}.{key}" if path else key)
+        elif x != y:
+            yield path, x, y
 
-    return walk(a, b, "")
+    found = walk(ours.model_dump(), theirs.model_dump(), "")
+    return next((item for item in found if item[0].startswith(within)), None)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
@@ -407,6 +419,8 @@ def _parse_override(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise UsageError(f"--set {text!r} must have the form section.key=value")
+    if key in ("preset", "variant"):  # each stands for many values, which a setting would not bring along
+        raise UsageError(f"--set cannot change the {key}; use --{key} {value}")
     try:
         parsed = tomllib.loads(f"v = {value}")["v"]
     except tomllib.TOMLDecodeError:

@@ -7,16 +7,29 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
+from collections.abc import Callable
+from functools import reduce
+from operator import getitem
 from typing import Any
 
+import zenoh
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
+from common.bus import Keys, NoAnswerError, ask
 from common.config import Config, differing_key, override, parse
 from common.errors import UsageError
-from common.messages import SCHEMA_VERSION, ContractReply, MessageError
+from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
 from common.networks import Encoder, load_state, make_encoder, state_of
 from common.observation import HISTORY
+
+AGREED = {
+    "observation": ("world.camera", "world.lidar", "encoder"),
+    "dynamics": ("world.robot", "world.dolly", "world.obstacles", "world.control_period", "world.substeps"),
+    "reward": ("world.reward", "world.max_episode_steps"),
+}
+"""The settings behind each field of the digest; obstacles, because a task's scene follows from them."""
 
 
 def _short(value: Any) -> str:
@@ -26,14 +39,15 @@ def _short(value: Any) -> str:
 
 def digest(config: Config, encoder: bytes) -> dict[str, str]:
     """Hashes of all that must agree, by field; `encoder` is the frozen encoder's weights."""
-    world = config.world.model_dump(mode="json")
-    settings = config.encoder.model_dump(mode="json")
+    values = config.model_dump(mode="json")
+    settings: dict[str, list[Any]] = {
+        field: [reduce(getitem, path.split("."), values) for path in paths] for field, paths in AGREED.items()
+    }
+    settings["observation"].append(HISTORY)
     return {
         "protocol": str(SCHEMA_VERSION),
-        "encoder": _short(settings) if config.encoder.end_to_end else _short(encoder),
-        "observation": _short([world["camera"], world["lidar"], settings, HISTORY]),
-        "dynamics": _short([world[k] for k in ("robot", "dolly", "control_period", "substeps")]),
-        "reward": _short([world["reward"], world["max_episode_steps"]]),
+        "encoder": _short(values["encoder"]) if config.encoder.end_to_end else _short(encoder),
+        **{field: _short(value) for field, value in settings.items()},
     }
 
 
@@ -73,7 +87,18 @@ def accept_contract(contract: ContractReply, overrides: tuple[str, ...] = ()) ->
     mine = digest(ours, contract.encoder)
     for field, value in contract.digest.items():
         if mine.get(field) != value:
-            found = differing_key(ours, theirs)
+            found = differing_key(ours, theirs, AGREED.get(field, (field,)))
             detail = f": {found[0]} is {found[1]} here and {found[2]} there" if found else ""
             raise UsageError(f"refused by run {contract.run!r}: {field} differs{detail}")
     return ours
+
+
+def fetch_contract(session: zenoh.Session, on_wait: Callable[[], None] | None = None) -> ContractReply:
+    """Asks whoever serves this endpoint for the run's contract, until somebody answers."""
+    while True:
+        try:
+            return ask(session, Keys("*").contract, Nothing(), ContractReply, timeout=5.0)
+        except NoAnswerError:
+            if on_wait:
+                on_wait()
+            time.sleep(0.3)

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgpack
 import zenoh
 
-from common.bus import BUSY, NoAnswerError, RefusedError, ask_bytes
+from common.bus import BUSY, INTERNAL_ERROR, NoAnswerError, RefusedError, ask_bytes
 from common.messages import Message, MessageError, Origin, encode
 
 log = logging.getLogger(__name__)
@@ -50,8 +50,9 @@ class Spool:
         folder.mkdir(parents=True, exist_ok=True)
         for torn in folder.glob("*/*.part"):
             torn.unlink()
-        self._waiting = sorted(folder.glob("*/*.msg"), key=lambda path: (path.stat().st_mtime_ns, path.name))
-        self._bytes = sum(path.stat().st_size for path in self._waiting)
+        found = sorted(folder.glob("*/*.msg"), key=lambda path: (path.stat().st_mtime_ns, path.name))
+        self._waiting = {path: path.stat().st_size for path in found}
+        self._bytes = sum(self._waiting.values())
         self._lock = threading.Lock()
         self.changed = threading.Event()
 
@@ -72,19 +73,19 @@ class Spool:
         part.write_bytes(record)
         part.rename(path)
         with self._lock:
-            self._waiting.append(path)
+            self._waiting[path] = len(record)
             self._bytes += len(record)
         self.changed.set()
 
     def first(self) -> tuple[Path, str, bytes, bytes] | None:
-        """The oldest message: its file, key, header and payload; unreadable ones are set aside, with a word."""
+        """The oldest message: its file, key, header and payload; unreadable ones are set aside and logged."""
         while self._waiting:
-            path = self._waiting[0]
+            path = next(iter(self._waiting))
             try:
                 key, header, payload = msgpack.unpackb(path.read_bytes())
                 unpack_header(header, payload)
                 return path, key, header, payload
-            except (OSError, ValueError, MessageError) as error:
+            except (OSError, ValueError, TypeError) as error:  # TypeError: msgpack of something else
                 log.warning("spool: %s is unreadable (%s); set aside", path, error)
                 self._forget(path)
                 if path.exists():
@@ -98,16 +99,15 @@ class Spool:
 
     def _forget(self, path: Path) -> None:
         with self._lock:
-            self._waiting.remove(path)
-            if path.exists():
-                self._bytes -= path.stat().st_size
+            self._bytes -= self._waiting.pop(path)
 
 
 class Sender:
     """Sends what is in a spool, in order, from a thread of its own, until acknowledged.
 
-    No reply and BUSY mean: again, later, with the same id. Any other refusal is final: the message is
-    dropped, counted in `refused` by reason and logged, and `last_refusal` holds the reason.
+    No reply, BUSY and an error within the receiver mean: again, later, with the same id. Any other refusal is
+    final: the message is dropped, counted in `refused` by reason and logged, and `last_refusal` holds the
+    reason.
     """
 
     def __init__(
@@ -118,16 +118,18 @@ class Sender:
         self.last_refusal = ""
         self.waiting_since: float | None = None
         self._session, self._actor, self._boot, self._timeout = session, actor, boot, timeout
-        self._seq = 0
+        self._seq, self._lock = 0, threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
     def put(self, key: str, message: Message) -> None:
         """Hands a message over for delivery on `key`."""
-        origin = Origin(actor=self._actor, boot=self._boot, seq=self._seq)
-        self._seq += 1
-        self.spool.put(origin, key, encode(message))
+        payload = encode(message)
+        with self._lock:
+            origin = Origin(actor=self._actor, boot=self._boot, seq=self._seq)
+            self.spool.put(origin, key, payload)
+            self._seq += 1
 
     def _run(self) -> None:
         pause, jitter = 0.1, random.Random()
@@ -141,19 +143,15 @@ class Sender:
             try:
                 ask_bytes(self._session, key, payload, header, self._timeout)
                 self.sent += 1
-            except RefusedError as error:
-                if str(error) != BUSY:
-                    self.last_refusal = str(error)
-                    self.refused[str(error).split(":")[0][:60]] += 1
-                    log.warning("refused for good on %s: %s", key, error)
-                else:
+            except (NoAnswerError, RefusedError, zenoh.ZError) as error:
+                if not isinstance(error, RefusedError) or str(error) in (BUSY, INTERNAL_ERROR):
+                    self.waiting_since = self.waiting_since or time.monotonic()
                     self._stop.wait(pause * jitter.uniform(0.5, 1.5))
+                    pause = min(2 * pause, 2.0)
                     continue
-            except (NoAnswerError, zenoh.ZError):
-                self.waiting_since = self.waiting_since or time.monotonic()
-                self._stop.wait(pause * jitter.uniform(0.5, 1.5))
-                pause = min(2 * pause, 2.0)
-                continue
+                self.last_refusal = str(error)
+                self.refused[str(error).split(":")[0][:60]] += 1
+                log.warning("refused for good on %s: %s", key, error)
             self.spool.remove(path)
             self.waiting_since, pause = None, 0.1
 
@@ -196,7 +194,7 @@ class DuplicateFilter:
         return [[*key, high, sorted(self._gaps[key])] for key, high in self._next.items()]
 
     def restore(self, state: list[list[object]]) -> None:
-        """Adds what another filter had seen."""
+        """Takes over what another filter had seen, in place of what is known of the same incarnations."""
         for actor, boot, high, gaps in state:
             key = str(actor), str(boot)
             self._next[key] = int(high)  # type: ignore[call-overload]

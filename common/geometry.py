@@ -60,7 +60,8 @@ class Rectangle:
 
 def wrap(angle: float) -> float:
     """The angle in (-pi, pi]."""
-    return math.pi - (math.pi - angle) % (2 * math.pi)
+    wrapped = math.remainder(angle, math.tau)
+    return math.pi if wrapped == -math.pi else wrapped
 
 
 def bearing(origin: SE2, x: float, y: float) -> float:

@@ -40,8 +40,10 @@ def _to_array(value: Any) -> NDArray[Any]:
     dtype, shape, raw = value
     if dtype not in ("float16", "float32", "float64", "uint8"):
         raise ValueError(f"dtype {dtype!r} is not allowed")
-    if not (isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape) and len(shape) <= 5):
-        raise ValueError("a shape is a list of at most five non-negative integers")
+    if not (
+        isinstance(shape, list) and 1 <= len(shape) <= 5 and all(type(n) is int and n >= 0 for n in shape)
+    ):
+        raise ValueError("a shape is a list of one to five non-negative integers")
     count = 1
     for n in shape:
         count *= n
@@ -267,7 +269,7 @@ def decode(kind: type[M], data: bytes) -> M:
         raise MessageError("a message is [version, type, fields]")
     version, name, fields = outer
     if version != SCHEMA_VERSION:
-        raise MessageError(f"schema version {version!r}, this side speaks {SCHEMA_VERSION}")
+        raise MessageError(f"schema version {str(version)[:40]!r}, this side speaks {SCHEMA_VERSION}")
     if name != kind.__name__:
         raise MessageError(f"message of type {str(name)[:40]!r} where {kind.__name__} is expected")
     try:

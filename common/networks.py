@@ -1,9 +1,10 @@
-"""The networks: image encoder, sensor fusion, policy and critic (figures of the network and ResNet blocks)."""
+"""The networks: image encoder, sensor fusion, policy and critic (figures of network and ResNet blocks)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from io import BytesIO
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -55,10 +56,10 @@ class Encoder(nn.Module):
         sizes = (3 * config.frames_per_code, *config.channels)
         blocks: list[nn.Module]
         if config.kind == "residual":
-            blocks = [ConcatBlock(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+            blocks = [ConcatBlock(a, b) for a, b in pairwise(sizes)]
         else:
             stem = nn.Sequential(nn.Conv2d(sizes[0], sizes[1], 4, stride=2, padding=1), nn.ReLU())
-            blocks = [stem, *(LightBlock(a, b) for a, b in zip(sizes[1:-1], sizes[2:], strict=True))]
+            blocks = [stem, *(LightBlock(a, b) for a, b in pairwise(sizes[1:]))]
         self.blocks = nn.Sequential(*blocks)
         self.frames_per_code = config.frames_per_code
         for module in self.modules():
@@ -68,13 +69,15 @@ class Encoder(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """(B, 3 * frames_per_code, S, S) float32 in [0, 1] -> (B, code) float32."""
-        return torch.flatten(self.blocks(frames), 1)
+        maps: Tensor = self.blocks(frames)
+        return maps.flatten(1)
 
     def encode_stacks(self, frames: Tensor) -> Tensor:
         """(B, 4, S, S, 3) uint8 -> (B, codes * code) float32, for training end to end."""
         b, n, s = frames.shape[:3]
         grouped = frames.reshape(b * n // self.frames_per_code, self.frames_per_code, s, s, 3)
-        return self(_to_channels(grouped)).reshape(b, -1)
+        codes: Tensor = self(_to_channels(grouped))
+        return codes.reshape(b, -1)
 
 
 def _to_channels(frames: Tensor) -> Tensor:
@@ -102,7 +105,7 @@ def compile_encoder(encoder: Encoder, image_size: int) -> Callable[[NDArray[np.u
     torch.onnx.export(
         encoder.eval(),
         (torch.zeros(1, channels, image_size, image_size),),
-        graph,
+        graph,  # type: ignore[arg-type]  # a file is taken, though not declared
         dynamo=False,  # the other exporter needs onnxscript, for the same graph
         input_names=["frames"],
         output_names=["code"],
@@ -123,7 +126,7 @@ def compile_encoder(encoder: Encoder, image_size: int) -> Callable[[NDArray[np.u
 
 def _mlp(sizes: tuple[int, ...], layer_norm: bool = False) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+    for a, b in pairwise(sizes):
         layers += [nn.Linear(a, b), *([nn.LayerNorm(b)] if layer_norm else []), nn.ReLU()]
     return nn.Sequential(*layers)
 
@@ -145,7 +148,7 @@ class FusionNetwork(nn.Module):
 
     def forward(self, flat: Tensor, *extra: Tensor) -> Tensor:
         """(B, layout.size), and (B, extra) if any -> (B, outputs)."""
-        visual, lidar, history = flat.split(self.sizes, dim=-1)
+        visual, lidar, history = torch.split(flat, self.sizes, dim=-1)
         parts = (visual, self.lidar_branch(lidar), self.history_branch(history), *extra)
         out: Tensor = self.output(self.head(torch.cat(parts, dim=-1)))
         return out
@@ -206,7 +209,9 @@ def flatten(observation: Observation, encoder: Encoder | None = None) -> Tensor:
 def initial_q(policy: Policy, critic: TwinCritic, flat: Tensor) -> NDArray[np.float64]:
     """Q(s0, a0) of start observations (B, layout.size): minimum of the twin critics at the greedy action."""
     with torch.no_grad():
-        return critic(flat, policy.mode(flat)).min(0).values.double().numpy()
+        twins: Tensor = critic(flat, policy.mode(flat))
+    least: NDArray[np.float64] = twins.amin(0).double().numpy()
+    return least
 
 
 def state_of(**modules: nn.Module) -> dict[str, Tensor]:

@@ -105,9 +105,9 @@ def observe(
     stacked = np.maximum(rows[:, None] - back, starts[:, None])
     past = rows[:, None] - np.arange(HISTORY, 0, -1)
     valid = past >= starts[:, None]
-    past = np.where(valid, past, rows[:, None])
-    actions = columns.action[past] * valid[..., None]
-    rewards = columns.reward[past] * valid
+    past = np.maximum(past, starts[:, None])
+    actions = np.where(valid[..., None], columns.action[past], np.float32(0))
+    rewards = np.where(valid, columns.reward[past], np.float32(0))
     return Observation(
         columns.visual[stacked],
         columns.lidar[rows],

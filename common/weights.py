@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+import queue
+import threading
 
+import zenoh
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from common.messages import MessageError, Version, WeightsBlob
+from common.bus import Keys, NoAnswerError, RefusedError, ask, subscribe
+from common.messages import MessageError, Nothing, Version, WeightsBlob
+
+log = logging.getLogger(__name__)
 
 
 def pack(version: Version, tensors: dict[str, Tensor]) -> WeightsBlob:
@@ -25,3 +32,30 @@ def unpack(message: WeightsBlob) -> dict[str, Tensor]:
         return dict(load_tensors(message.blob))
     except Exception as error:  # safetensors raises its own class without exporting a common base
         raise MessageError(f"weights are not safetensors: {error}") from None
+
+
+class WeightsPuller:
+    """Keeps the newest weights of a kind at hand: hears of versions, pulls them from a thread of its own."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, kind: str) -> None:
+        self.newest: tuple[Version, dict[str, Tensor]] | None = None
+        self._session, self._key = session, keys.weights(kind)
+        self._heard: queue.SimpleQueue[Version] = queue.SimpleQueue()
+        self._subscription = subscribe(session, keys.version, Version, self._heard.put)
+        threading.Thread(target=self._run, name="weights", daemon=True).start()
+
+    def _run(self) -> None:
+        self._pull()  # a late joiner does not wait for the next version
+        while True:
+            version = self._heard.get()
+            while not self._heard.empty():
+                version = self._heard.get()
+            if self.newest is None or self.newest[0] < version:
+                self._pull()
+
+    def _pull(self) -> None:
+        try:
+            blob = ask(self._session, self._key, Nothing(), WeightsBlob, timeout=10.0)
+            self.newest = blob.version, unpack(blob)
+        except (NoAnswerError, RefusedError, MessageError, zenoh.ZError) as error:
+            log.info("no weights: %s", error)

@@ -1,0 +1,204 @@
+"""The actor process: asks the curriculum for tasks, drives the worlds, ships episodes, outcomes, candidates."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+import uuid
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from actor.inference import Eyes, PolicyActor
+from actor.rollout import Finished, Rollout
+from common.bus import Keys, announce, ask_later
+from common.config import Config
+from common.contract import contract_encoder
+from common.delivery import Sender, Spool
+from common.messages import (
+    Candidate,
+    Candidates,
+    ContractReply,
+    Episode,
+    Outcome,
+    Proposal,
+    Proposals,
+    TaskQuery,
+    Version,
+)
+from common.tasks import Task, candidate_task, random_task
+from common.telemetry import Rate, Reporter
+from common.weights import WeightsPuller
+
+log = logging.getLogger(__name__)
+CANDIDATE_BATCH = 40
+
+
+class ActorService:
+    """One actor process: W worlds, each its own agent in everything the paper says of agents."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        contract: ContractReply,
+        config: Config,
+        name: str,
+        spool: Path,
+        cells: list[int],
+    ) -> None:
+        self.config, self.contract, self.name = config, contract, name
+        self.keys = Keys(contract.run)
+        self._session = session
+        boot = uuid.uuid4().hex[:12]
+        # the boot id in the seed: a restarted actor drives other episodes than its predecessor
+        seeds = np.random.SeedSequence([config.seed, *boot.encode()]).spawn(2)
+        self._rng = np.random.default_rng(seeds[0])
+        self._token = announce(session, self.keys, "actor", name)
+        eyes = Eyes(config, contract_encoder(contract, config))
+        self._rollout = Rollout(config, eyes, config.actor.worlds, config.world.max_episode_steps)
+        self._actor = PolicyActor(config, len(self._rollout), np.random.default_rng(seeds[1]))
+        self._cells = [cells[i % len(cells)] for i in range(len(self._rollout))]
+        self._weights = WeightsPuller(session, self.keys, "policy")
+        limit = config.actor.spool_megabytes * 2**20
+        self._episodes = Sender(session, Spool(spool / "learner", limit), name, boot)
+        self._reports = Sender(session, Spool(spool / "curriculum", limit / 8), name, boot, timeout=5.0)
+        self._proposals: list[Proposal | None] = [None] * len(self._rollout)
+        self._first_version = [Version()] * len(self._rollout)
+        self._agent_steps = [0] * len(self._rollout)
+        self._answers: queue.SimpleQueue[tuple[int, Proposals | None]] = queue.SimpleQueue()
+        self._candidates: list[Candidate] = []
+        self._categories: Counter[str] = Counter()
+        self._endings: Counter[str] = Counter()
+        self._reporter = Reporter(session, self.keys, "actor", name)
+        self._rate = Rate()
+
+    def run(self) -> None:
+        """Drives until SystemExit."""
+        for slot in range(len(self._rollout)):
+            for _ in range(self.config.actor.candidates_at_start):
+                self._look(slot)
+            self._send_candidates()
+            self._ask(slot)
+        while True:
+            self._start_answered()
+            self._refresh_weights()
+            if self._episodes.spool.full:
+                time.sleep(0.1)  # back-pressure: the learner is behind or away
+            else:
+                for finished in self._rollout.step(self._actor):
+                    self._ship(finished)
+            if len(self._rollout.idle) == len(self._rollout):
+                time.sleep(0.002)
+            if self._reporter.due:
+                self._report()
+
+    def close(self) -> None:
+        """Delivers what is waiting, as far as a few seconds allow; the rest stays in the spool."""
+        left = self._episodes.close(patience=2.0)
+        self._reports.close(patience=0.2)
+        self._rollout.close()
+        if left:
+            log.warning("%d episodes stay in the spool %s", left, self._episodes.spool.folder)
+
+    def _ask(self, slot: int) -> None:
+        """Asks for the slot's next task; the other worlds go on meanwhile."""
+        query = TaskQuery(cell=self._cells[slot], t=self._agent_steps[slot])
+        ask_later(
+            self._session,
+            self.keys.task,
+            query,
+            Proposals,
+            lambda answer, slot=slot: self._answers.put((slot, answer)),  # type: ignore[misc]
+            self.config.actor.task_timeout,
+        )
+
+    def _start_answered(self) -> None:
+        while not self._answers.empty():
+            slot, answer = self._answers.get()
+            proposal = answer.tasks[0] if answer and answer.tasks else None
+            if proposal is not None and proposal.task.cell != self._cells[slot]:
+                proposal = None
+            task = proposal.task if proposal else random_task(self._cells[slot], self.config, self._rng)
+            self._proposals[slot] = proposal
+            self._categories[proposal.category if proposal else "unserved"] += 1
+            self._actor.refresh(slot)
+            self._first_version[slot] = self._actor.version(slot)
+            self._rollout.reset(slot, task)
+
+    def _refresh_weights(self) -> None:
+        newest = self._weights.newest
+        if newest is not None and self._actor.newest.version < newest[0]:
+            self._actor.load(*newest)
+            if self.config.actor.refresh == "step":
+                for slot in range(len(self._rollout)):
+                    self._actor.refresh(slot)
+
+    def _ship(self, finished: Finished) -> None:
+        slot, proposal, columns = finished.slot, self._proposals[finished.slot], finished.columns
+        self._agent_steps[slot] += len(columns.reward) - 1
+        self._endings[finished.ending] += 1
+        category = proposal.category if proposal else "unserved"
+        episode = Episode(
+            digest=self.contract.digest,
+            task=finished.task,
+            visual=columns.visual,
+            lidar=columns.lidar,
+            action=columns.action,
+            reward=columns.reward,
+            ending=finished.ending,
+            first_version=self._first_version[slot],
+            last_version=self._actor.version(slot),
+            category=category,
+        )
+        self._episodes.put(self.keys.trajectory, episode)
+        if proposal is not None and not self._reports.spool.full:
+            outcome = Outcome(
+                digest=self.contract.digest,
+                proposal=proposal.id,
+                task=proposal.task,
+                properties=proposal.properties,
+                q=proposal.q,
+                success=finished.ending == "success",
+                category=category,
+            )
+            self._reports.put(self.keys.result, outcome)
+        self._look(slot)
+        self._ask(slot)
+
+    def _look(self, slot: int) -> None:
+        """Adds one more candidate start to the next batch for the curriculum's task database."""
+        if self.config.curriculum.algorithm == "rnd":
+            return
+        task: Task = candidate_task(self._cells[slot], self.config, self._rng)
+        self._candidates.append(self._rollout.look(slot, task))
+        if len(self._candidates) >= CANDIDATE_BATCH:
+            self._send_candidates()
+
+    def _send_candidates(self) -> None:
+        if self._candidates and not self._reports.spool.full:
+            self._reports.put(
+                self.keys.candidates,
+                Candidates(digest=self.contract.digest, candidates=self._candidates),
+            )
+        self._candidates = []
+
+    def _report(self) -> None:
+        waiting = self._episodes.waiting_since
+        self._reporter.report(
+            {
+                "env_steps": self._rollout.steps,
+                "steps_per_s": round(self._rate.read(self._rollout.steps), 1),
+                "spool": len(self._episodes.spool),
+                "spool_full": int(self._episodes.spool.full),
+                "acknowledged": self._episodes.sent,
+                "refused": sum(self._episodes.refused.values()),
+                "refusal": self._episodes.last_refusal[:120],
+                "weights": self._actor.newest.version.counter,
+                "waiting_s": round(time.monotonic() - waiting, 1) if waiting else 0.0,
+                **{f"ending_{key}": value for key, value in self._endings.items()},
+                **{f"task_{key}": value for key, value in self._categories.items()},
+            }
+        )

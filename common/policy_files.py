@@ -1,0 +1,53 @@
+"""A policy on disk: a folder with config.toml and networks.safetensors, written whole or not at all.
+
+What the learner writes as checkpoint or snapshot and what evaluation reads.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from common.config import Config, parse
+from common.errors import UsageError
+
+CONFIG, NETWORKS = "config.toml", "networks.safetensors"
+
+
+def save_folder(folder: Path, texts: dict[str, str], tensors: dict[str, dict[str, Tensor]]) -> None:
+    """Writes files of text and of tensors into a new folder by way of a temporary name."""
+    part = folder.with_name(folder.name + ".part")
+    if part.exists():
+        shutil.rmtree(part)
+    part.mkdir(parents=True)
+    for name, text in texts.items():
+        (part / name).write_text(text, "utf-8")
+    for name, group in tensors.items():
+        save_file({key: value.detach().contiguous() for key, value in group.items()}, part / name)
+    if folder.exists():
+        shutil.rmtree(folder)
+    os.replace(part, folder)
+
+
+def load_tensors(file: Path) -> dict[str, Tensor]:
+    """The tensors of a file; raises UsageError when it is missing or damaged."""
+    try:
+        return dict(load_file(file))
+    except FileNotFoundError:
+        raise UsageError(f"{file} does not exist") from None
+    except (SafetensorError, OSError) as error:
+        raise UsageError(f"{file} is damaged: {error}") from None
+
+
+def load_policy(folder: Path) -> tuple[Config, dict[str, Tensor]]:
+    """Configuration and networks; raises UsageError when `folder` is no policy, or a damaged one."""
+    if not (folder / CONFIG).is_file():
+        raise UsageError(
+            f"{folder} is no policy: a checkpoint folder with {CONFIG} and {NETWORKS} is expected"
+        )
+    return parse((folder / CONFIG).read_text("utf-8")), load_tensors(folder / NETWORKS)

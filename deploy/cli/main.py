@@ -1,0 +1,49 @@
+"""The `navaclq` command: one module per group of commands, and one way to report wrong use."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from typer.exceptions import TyperException
+
+from common.bus import NoAnswerError, RefusedError
+from common.errors import UsageError
+from deploy.cli import config, curriculum, doctor, evaluate, processes, train, world
+
+app = typer.Typer(
+    name="navaclq",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Train mobile robots to dock from camera and LiDAR: distributed SAC with an automatic curriculum.",
+)
+app.command("train")(train.train)
+app.command("learner")(processes.learner)
+app.command("actor")(processes.actor)
+app.command("evaluate")(evaluate.evaluate)
+app.command("doctor")(doctor.doctor)
+app.add_typer(curriculum.app, name="curriculum")
+app.add_typer(world.app, name="world")
+app.add_typer(config.app, name="config")
+
+
+def run() -> None:
+    """Entry point: exit 0 on success, 2 on wrong use with one sentence, 1 when nobody answers or it failed."""
+    try:
+        code = app(standalone_mode=False)
+    except UsageError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(2)
+    except (NoAnswerError, RefusedError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(1)
+    except TyperException as error:
+        message = error.format_message()
+        sys.stderr.write(f"error: {message or 'a command is missing; see navaclq --help'}\n")
+        sys.exit(2)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,71 @@
+"""Options that several commands share, and the error handling of all."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from common.bus import check_endpoint
+from common.config import Config, resolve
+from common.errors import UsageError
+from common.tasks import check_cell
+
+Run = Annotated[Path, typer.Option("--run", help="Run directory; made when it does not exist, else resumed.")]
+Preset = Annotated[str | None, typer.Option(help="Starting configuration: fast (default), paper or smoke.")]
+Variant = Annotated[
+    str | None, typer.Option(help="navacl-q (default), rnd (uniform starts) or e2e (the encoder trains too).")
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file on top of the preset.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", help="section.key=value on top of all; may be repeated.")
+]
+Seed = Annotated[
+    int | None, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random (default 0).")
+]
+Connect = Annotated[str, typer.Option(help="Endpoint of the hub, tcp/HOST:PORT.")]
+Insecure = Annotated[
+    bool, typer.Option("--insecure", help="Allow plain TCP beyond loopback: anybody on the way can read it.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Minutes = Annotated[
+    float | None, typer.Option(min=0.01, help="Minutes from the first environment step to the last update.")
+]
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def configuration(
+    preset: str | None, variant: str | None, file: Path | None, settings: list[str] | None, seed: int | None
+) -> Config:
+    """The configuration that the common options ask for."""
+    return resolve(preset, file, tuple(settings or ()), variant, seed)
+
+
+def endpoint(text: str, insecure: bool) -> str:
+    """A checked endpoint."""
+    return check_endpoint(text, insecure)
+
+
+def parse_cells(text: str) -> list[int]:
+    """Cells from a list such as `0,3-5`; raises UsageError for anything else."""
+    cells: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        if not first.isdigit() or (dash and not last.isdigit()):
+            raise UsageError(f"--cells {text!r} is no list of cells; write for example 0,3-5")
+        cells += range(int(first), int(last or first) + 1)
+    for cell in cells:
+        check_cell(cell)
+    if not cells:
+        raise UsageError(f"--cells {text!r} names no cell; write for example 0,3-5")
+    return cells
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """One JSON object on stdout."""
+    sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,162 @@
+"""`navaclq train`: the main job, learner + curriculum + actors on this machine, supervised."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from common.bus import Keys, open_client
+from common.config import parse
+from common.errors import UsageError
+from common.policy_files import CONFIG
+from common.tasks import suite as suite_tasks
+from common.telemetry import exit_on_signals
+from deploy.cli import options
+from deploy.cli.evaluate import run_suite
+from deploy.launcher import Child, Supervisor, free_port
+from deploy.screen import Monitor, Screen
+
+SPARE_CORES = 1
+"""Cores left to the learner when the number of actors is not given."""
+
+
+def train(
+    run: options.Run = Path("runs/default"),
+    minutes: options.Minutes = 40.0,
+    actors: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Actor processes; default: cores less one.")
+    ] = None,
+    preset: options.Preset = None,
+    variant: options.Variant = None,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+    seed: options.Seed = None,
+    evaluation: Annotated[
+        str | None,
+        typer.Option("--eval", help="Suite on which to compare untrained and trained policy afterwards."),
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="TCP port of the hub; default: a free one.")
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Train: starts learner, curriculum and actors, shows their progress, stops them, sums up."""
+    if not (run / "run.json").exists() or any((preset, variant, config, settings, seed is not None)):
+        options.configuration(preset, variant, config, settings, seed)
+    if evaluation is not None:
+        suite_tasks(evaluation, options.configuration(None, None, None, None, None))
+    count = actors or max(1, (os.cpu_count() or 2) - SPARE_CORES)
+    asked = _arguments(preset, variant, config, settings, seed)
+    exit_on_signals()
+    load = _supervise(run, minutes or 40.0, count, f"tcp/127.0.0.1:{port or free_port()}", asked)
+    result = _summary(run, minutes or 40.0, load)
+    if evaluation is not None:
+        result["eval"] = _compare(run, evaluation, result["seed"])
+    (run / "result.json").write_text(json.dumps(result, indent=1), "utf-8")
+    if as_json:
+        options.print_json(result)
+    else:
+        _print_summary(result, run)
+
+
+def _arguments(
+    preset: str | None, variant: str | None, config: Path | None, settings: list[str] | None, seed: int | None
+) -> list[str]:
+    pairs = (("--preset", preset), ("--variant", variant), ("--config", config), ("--seed", seed))
+    given = [text for name, value in pairs if value is not None for text in (name, str(value))]
+    return given + [text for setting in settings or () for text in ("--set", setting)]
+
+
+def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[str]) -> float:
+    """Runs the processes until the learner's time is over; returns the load average at the end."""
+    elapsed = [0.0]
+
+    def learner() -> list[str]:
+        left = max(0.01, minutes - elapsed[0] / 60)
+        return ["learner", "--run", str(run), "--listen", address, "--minutes", f"{left:.4f}", *asked]
+
+    screen: Screen | None = None
+    early: list[str] = []
+    supervisor = Supervisor(lambda event: screen.say(event) if screen else early.append(event))
+    main = Child("learner", learner, run / "logs" / "learner.log")
+    try:
+        supervisor.add(main)
+        while not (run / "run.json").exists():
+            supervisor.check()
+            time.sleep(0.05)
+        join = ["--connect", address]
+        serve = ["curriculum", "serve", "--run", str(run), *join]
+        supervisor.add(Child("curriculum", lambda: serve, run / "logs" / "curriculum.log"))
+        for i in range(count):
+            command = ["actor", "--name", f"local-{i}", "--spool", str(run / "spool"), *join]
+            supervisor.add(
+                Child(f"local-{i}", lambda command=command: command, run / "logs" / f"local-{i}.log")  # type: ignore[misc]
+            )
+        with open_client(address, lambda waited: supervisor.check()) as session:
+            monitor = Monitor(session, Keys(run.resolve().name))
+            screen = Screen(monitor, f"navaclq train {run}")
+            for event in early:
+                screen.say(event)
+            screen.say(
+                f"training into {run} for {minutes:g} min with {count} actor process(es), hub {address}"
+            )
+            while not main.finished:
+                supervisor.check()
+                elapsed[0] = max(elapsed[0], float(monitor.learner.get("elapsed_s", 0.0)))
+                screen.update(lambda: [(c.name, c.alive, c.restarts) for c in supervisor.children])
+                time.sleep(0.2)
+        return os.getloadavg()[0]
+    finally:
+        if screen:
+            screen.close()
+        supervisor.stop()
+
+
+def _summary(run: Path, minutes: float, load: float) -> dict[str, Any]:
+    config = parse((run / CONFIG).read_text("utf-8"))
+    learned = json.loads((run / "summary.json").read_text("utf-8"))
+    return {
+        "run": run.resolve().name,
+        "seed": config.seed,
+        "preset": config.preset,
+        "variant": config.variant,
+        "minutes": minutes,
+        "env_steps": learned["env_steps"],
+        "episodes": learned["episodes"],
+        "updates": learned["updates"],
+        "load_average": round(load, 2),
+        "training": learned["figures"],
+    }
+
+
+def _compare(run: Path, suite: str, seed: int) -> dict[str, Any]:
+    """Untrained against trained policy on a suite, greedy; outside the training's clock."""
+    workers = os.cpu_count() or 1
+    policies = {"before": run / "snapshots" / "initial", "after": run / "snapshots" / "final"}
+    if missing := [path for path in policies.values() if not path.exists()]:
+        raise UsageError(f"{missing[0]} is missing: nothing to evaluate")
+    config = parse((run / CONFIG).read_text("utf-8"))
+    found = {name: run_suite(path, suite, workers, True, seed, name) for name, path in policies.items()}
+    return {"suite": suite, "episodes": len(suite_tasks(suite, config)), **found}
+
+
+def _print_summary(result: dict[str, Any], run: Path) -> None:
+    lines = [
+        f"{result['env_steps']} environment steps, {result['episodes']} episodes, {result['updates']} updates "
+        f"in {result['minutes']:g} min (load average {result['load_average']})",
+    ]
+    if "eval" in result:
+        found = result["eval"]
+        for name, label in (("before", "untrained"), ("after", "trained")):
+            shares = ", ".join(f"{k.replace('_', ' ')} {100 * v:.0f}%" for k, v in found[name].items())
+            lines.append(
+                f"{label} policy on suite {found['suite']} ({found['episodes']} tasks, greedy): {shares}"
+            )
+    lines.append(f"policy: {run / 'snapshots' / 'final'}; curves: tensorboard --logdir {run / 'tensorboard'}")
+    sys.stdout.write("\n".join(lines) + "\n")

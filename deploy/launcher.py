@@ -1,0 +1,130 @@
+"""The local launcher: starts the processes of a run as separate commands, watches and restarts them."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from common.errors import UsageError
+
+log = logging.getLogger("navaclq")
+STOP_SECONDS = 4.0
+LONGEST_BACK_OFF = 30.0
+
+
+def free_port() -> int:
+    """A TCP port on loopback that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass
+class Child:
+    """A supervised process. `command` is asked anew at every start, for arguments that depend on the time."""
+
+    name: str
+    command: Callable[[], list[str]]
+    log_file: Path
+    process: subprocess.Popen[bytes] | None = None
+    restarts: int = 0
+    finished: bool = False
+    """True once it has ended by itself with exit code 0."""
+    next_start: float = 0.0
+    started: float = 0.0
+    back_off: float = 0.5
+    output: IO[bytes] | None = field(default=None, repr=False)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self.process is not None and self.process.poll() is None
+
+    def start(self) -> None:
+        """Starts the process in a session of its own, its output appended to the log file."""
+        self.log_file.parent.mkdir(parents=True, exist_ok=True)
+        with self.log_file.open("ab") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "deploy.cli.main", *self.command()],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,  # Ctrl-C reaches the launcher, which stops its children in order
+            )
+        self.started = time.monotonic()
+
+    def last_words(self) -> str:
+        """The last line that it wrote."""
+        lines = (
+            self.log_file.read_text("utf-8", "replace").strip().splitlines() if self.log_file.exists() else []
+        )
+        return lines[-1] if lines else "it wrote nothing"
+
+
+class Supervisor:
+    """Keeps children running: one that dies is restarted after a back-off that doubles up to 30 s."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self.children: list[Child] = []
+        self._report = report
+
+    def add(self, child: Child) -> None:
+        """Starts a child and supervises it from now on."""
+        self.children.append(child)
+        child.start()
+
+    def check(self) -> None:
+        """Looks after all children; raises UsageError with its words when one refuses at its first start."""
+        now = time.monotonic()
+        for child in self.children:
+            if child.finished or child.process is None:
+                continue
+            code = child.process.poll()
+            if code is None:
+                if now - child.started > 60:
+                    child.back_off = 0.5
+            elif code == 0:
+                child.finished = True
+            elif child.next_start == 0.0:
+                if code == 2:
+                    raise UsageError(f"{child.name}: {child.last_words().removeprefix('error: ')}")
+                child.next_start = now + child.back_off
+                self._report(
+                    f"{child.name} ended with {_reason(code)}; restart in {child.back_off:.1f} s "
+                    f"(log: {child.log_file})"
+                )
+                child.back_off = min(2 * child.back_off, LONGEST_BACK_OFF)
+            elif now >= child.next_start:
+                child.restarts += 1
+                child.next_start = 0.0
+                child.start()
+
+    def stop(self) -> None:
+        """SIGTERM to all in the order actors, curriculum, learner (last added first); SIGKILL after 4 s each."""
+        for child in reversed(self.children):
+            if child.alive and child.process:
+                child.process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + STOP_SECONDS
+        for child in reversed(self.children):
+            if child.process is None:
+                continue
+            try:
+                child.process.wait(timeout=max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                self._report(f"{child.name} did not stop within {STOP_SECONDS:.0f} s; killed")
+                child.process.kill()
+                child.process.wait()
+
+
+def _reason(code: int) -> str:
+    if code < 0:
+        return f"signal {signal.Signals(-code).name}"
+    return f"exit code {code}"

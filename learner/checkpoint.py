@@ -1,0 +1,111 @@
+"""The run directory: its identity, and checkpoints that are whole or absent."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+from torch import Tensor
+
+from common.config import Config, differing_key, parse
+from common.errors import UsageError
+from common.policy_files import CONFIG, NETWORKS, load_tensors, save_folder
+from learner.sac import SAC
+
+RUN_SCHEMA = 1
+"""Version of the run directory's layout."""
+
+
+class RunDirectory:
+    """`runs/NAME`: config.toml, run.json, log/, checkpoints/, snapshots/, tensorboard/."""
+
+    def __init__(self, folder: Path, config: Config | None = None) -> None:
+        """Opens a run, or with `config` starts one; raises UsageError when the folder is something else."""
+        self.folder, self.name = folder, folder.resolve().name
+        identity = folder / "run.json"
+        if identity.exists():
+            self.config = self._open(identity, config)
+        elif config is None:
+            raise UsageError(f"{folder} is no run directory: it has no run.json")
+        elif folder.exists() and any(p.name not in ("logs", "spool") for p in folder.iterdir()):
+            raise UsageError(f"{folder} is not empty and no run directory; choose another --run")
+        else:
+            self.config = config
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / CONFIG).write_text(config.to_toml(), "utf-8")
+            write_atomically(identity, json.dumps({"schema": RUN_SCHEMA, "epoch": 0}))
+
+    def _open(self, identity: Path, wanted: Config | None) -> Config:
+        try:
+            schema = json.loads(identity.read_text("utf-8"))["schema"]
+        except (ValueError, KeyError, TypeError):
+            raise UsageError(f"{identity} is damaged") from None
+        if schema != RUN_SCHEMA:
+            raise UsageError(
+                f"{self.folder} was made by an incompatible version (run schema {schema}, this one has {RUN_SCHEMA})"
+            )
+        config = parse((self.folder / CONFIG).read_text("utf-8"))
+        if wanted is not None and (found := differing_key(wanted, config)):
+            key, asked, has = found
+            raise UsageError(
+                f"{self.folder} exists with {key} = {has}, asked was {asked}; "
+                "resume it without that setting or choose another --run"
+            )
+        return config
+
+    def next_epoch(self) -> int:
+        """Counts one more start of the learner and remembers it; never runs backwards."""
+        identity = self.folder / "run.json"
+        values = json.loads(identity.read_text("utf-8"))
+        values["epoch"] += 1
+        write_atomically(identity, json.dumps(values))
+        return int(values["epoch"])
+
+    def save(self, sac: SAC, env_steps: int) -> None:
+        """A checkpoint of all that learns; keeps the newest few."""
+        networks, moments = sac.state()
+        state = {"updates": sac.updates, "env_steps": env_steps}
+        folder = self.folder / "checkpoints" / f"{sac.updates:09d}"
+        self._write(folder, {NETWORKS: networks, "optimizers.safetensors": moments}, state)
+        for old in self.checkpoints()[: -self.config.learner.keep_checkpoints]:
+            shutil.rmtree(old)
+
+    def snapshot(self, name: str, networks: dict[str, Tensor], state: dict[str, int]) -> Path:
+        """Keeps a policy for evaluation."""
+        folder = self.folder / "snapshots" / name
+        self._write(folder, {NETWORKS: networks}, state)
+        return folder
+
+    def checkpoints(self) -> list[Path]:
+        """Whole checkpoints, oldest first."""
+        return sorted(p for p in (self.folder / "checkpoints").glob("*") if p.suffix != ".part")
+
+    def restore(self, sac: SAC) -> int:
+        """Loads the newest checkpoint, if there is one; returns its update count, else 0."""
+        checkpoints = self.checkpoints()
+        if not checkpoints:
+            return 0
+        newest = checkpoints[-1]
+        try:
+            updates = int(json.loads((newest / "state.json").read_text("utf-8"))["updates"])
+            sac.load(
+                load_tensors(newest / NETWORKS), load_tensors(newest / "optimizers.safetensors"), updates
+            )
+        except (OSError, ValueError, KeyError) as error:
+            raise UsageError(
+                f"checkpoint {newest} does not fit: {error}; remove it to use an older one"
+            ) from None
+        return updates
+
+    def _write(self, folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, int]) -> None:
+        texts = {CONFIG: self.config.to_toml(), "state.json": json.dumps(state)}
+        save_folder(folder, texts, tensors)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replaces a small file by way of a temporary name."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, "utf-8")
+    os.replace(part, path)

@@ -1,0 +1,188 @@
+"""Soft actor-critic (section 3.1, algorithm 3), written to be read against the paper's equations."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from common.config import Config
+from common.networks import Encoder, Policy, TwinCritic, flatten, load_state, make_encoder, state_of
+from common.observation import ObservationLayout
+from learner.replay.buffer import Batch
+
+
+class Losses(NamedTuple):
+    """One update's figures; policy figures are NaN when the policy was not updated."""
+
+    critic: float
+    q: float
+    policy: float
+    entropy: float
+    alpha: float
+
+
+def td_target(reward: Tensor, discount: Tensor, q_next: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
+    """r + gamma (min_i Q_i(s', a') - alpha log pi(a' | s')), all (B,); q_next (2, B). `discount` is 0 at the end."""
+    return reward + discount * (q_next.min(0).values - alpha * log_density)
+
+
+def critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """J_Q: importance-weighted mean of (Q - target)^2 / 2, summed over the twins; q (2, B)."""
+    return (weight * 0.5 * (q - target) ** 2).mean(1).sum()
+
+
+def policy_loss(q: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
+    """J_pi: mean of alpha log pi(a | s) - min_i Q_i(s, a); q (2, B)."""
+    return (alpha * log_density - q.min(0).values).mean()
+
+
+def temperature_loss(log_alpha: Tensor, log_density: Tensor, target_entropy: float) -> Tensor:
+    """J(alpha) = mean of -alpha (log pi(a | s) + target entropy), with alpha's logarithm as the variable."""
+    return -(log_alpha * (log_density + target_entropy)).mean()
+
+
+class SAC:
+    """Networks, targets and optimisers, updated from batches; what the learner checkpoints.
+
+    n-step targets leave out the entropy of the steps in between, as is usual. End to end the encoder is part
+    of the critic: its target has a target encoder, the policy reads codes without a gradient.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config, self.updates = config, 0
+        self._generator = torch.Generator().manual_seed(config.seed)
+        layout = ObservationLayout.of(config)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed + 1)
+            self.policy = Policy(layout, config.network)
+            self.critic = TwinCritic(layout, config.network)
+        self.encoder: Encoder | None = make_encoder(config) if config.encoder.end_to_end else None
+        self.target = copy.deepcopy(self.critic).requires_grad_(False)
+        self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False) if self.encoder else None
+        self.log_alpha = torch.tensor(math.log(config.sac.initial_alpha), requires_grad=True)
+        rate = config.sac.learning_rate
+        learned = [*self.critic.parameters(), *(self.encoder.parameters() if self.encoder else ())]
+        self.optimizers = {
+            "critic": torch.optim.Adam(learned, rate, fused=True),
+            "policy": torch.optim.Adam(self.policy.parameters(), rate, fused=True),
+            "temperature": torch.optim.Adam([self.log_alpha], rate),
+        }
+        self._online = learned
+        self._targets = [
+            *self.target.parameters(),
+            *(self.target_encoder.parameters() if self.target_encoder else ()),
+        ]
+
+    @property
+    def alpha(self) -> Tensor:
+        """The temperature, without gradient."""
+        return self.log_alpha.detach().exp()
+
+    def update(self, batch: Batch) -> tuple[Losses, NDArray[np.float64]]:
+        """One gradient step on everything that is due; returns figures and |TD error| (B,), the twins' mean."""
+        sac = self.config.sac
+        action, reward, discount, weight = (
+            torch.from_numpy(part) for part in (batch.action, batch.reward, batch.discount, batch.weight)
+        )
+        with torch.no_grad():
+            following = flatten(batch.next_observation, self.encoder)
+            next_action, next_log_density = self.policy.sample(following, self._noise(len(reward)))
+            if self.target_encoder is not None:
+                following = flatten(batch.next_observation, self.target_encoder)
+            target = td_target(
+                reward, discount, self.target(following, next_action), self.alpha, next_log_density
+            )
+        flat = flatten(batch.observation, self.encoder)
+        q = self.critic(flat, action)
+        loss = critic_loss(q, target, weight)
+        self._step("critic", loss)
+        policy, entropy = math.nan, math.nan
+        if self.updates % sac.policy_delay == 0:
+            policy, entropy = self._update_policy(flat.detach())
+        self.updates += 1
+        self._update_targets()
+        errors = (q.detach() - target).abs().mean(0).double().numpy()
+        figures = Losses(loss.item(), q.detach().mean().item(), policy, entropy, self.alpha.item())
+        return figures, errors
+
+    def _update_policy(self, flat: Tensor) -> tuple[float, float]:
+        sac = self.config.sac
+        action, log_density = self.policy.sample(flat, self._noise(len(flat)))
+        self.critic.requires_grad_(False)
+        loss = policy_loss(self.critic(flat, action), self.alpha, log_density)
+        self._step("policy", loss)
+        self.critic.requires_grad_(True)
+        self._step("temperature", temperature_loss(self.log_alpha, log_density.detach(), sac.target_entropy))
+        if sac.alpha_floor > 0:
+            with torch.no_grad():
+                self.log_alpha.clamp_(min=math.log(sac.alpha_floor))
+        return loss.item(), -log_density.detach().mean().item()
+
+    def _update_targets(self) -> None:
+        sac = self.config.sac
+        with torch.no_grad():
+            if sac.target == "soft":
+                torch._foreach_lerp_(self._targets, self._online, sac.tau)
+            elif self.updates % sac.target_interval == 0:
+                torch._foreach_copy_(self._targets, self._online)
+
+    def _step(self, name: str, loss: Tensor) -> None:
+        self.optimizers[name].zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizers[name].step()
+
+    def _noise(self, size: int) -> Tensor:
+        return torch.randn(size, 2, generator=self._generator)
+
+    def policy_state(self) -> dict[str, Tensor]:
+        """What an actor needs."""
+        return state_of(policy=self.policy, **({"encoder": self.encoder} if self.encoder else {}))
+
+    def critic_state(self) -> dict[str, Tensor]:
+        """What the curriculum needs for Q(s0, a0): the target critics to the letter (alg. 2), else the current."""
+        critic = self.target if self.config.curriculum.algorithm == "navacl-q" else self.critic
+        return self.policy_state() | state_of(critic=critic)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Networks and optimisers as flat dictionaries of tensors."""
+        encoders = (
+            {"encoder": self.encoder, "target_encoder": self.target_encoder}
+            if self.encoder and self.target_encoder
+            else {}
+        )
+        networks = state_of(policy=self.policy, critic=self.critic, target=self.target, **encoders)
+        networks["log_alpha"] = self.log_alpha.detach()
+        moments = {}
+        for name, optimizer in self.optimizers.items():
+            for index, slots in optimizer.state_dict()["state"].items():
+                moments |= {f"{name}.{index}.{key}": value for key, value in slots.items()}
+        moments["generator"] = self._generator.get_state()
+        return networks, moments
+
+    def load(self, networks: dict[str, Tensor], moments: dict[str, Tensor], updates: int) -> None:
+        """Takes what `state` gave; raises ValueError naming the first tensor that does not fit."""
+        load_state(networks, policy=self.policy, critic=self.critic, target=self.target)
+        if self.encoder and self.target_encoder:
+            load_state(networks, encoder=self.encoder, target_encoder=self.target_encoder)
+        with torch.no_grad():
+            self.log_alpha.copy_(networks["log_alpha"])
+        for name, optimizer in self.optimizers.items():
+            state = optimizer.state_dict()
+            state["state"] = {
+                index: {
+                    key: moments[f"{name}.{index}.{key}"]
+                    for key in ("step", "exp_avg", "exp_avg_sq")
+                    if f"{name}.{index}.{key}" in moments
+                }
+                for index in state["param_groups"][0]["params"]
+                if f"{name}.{index}.step" in moments
+            }
+            optimizer.load_state_dict(state)
+        self._generator.set_state(moments["generator"])
+        self.updates = updates

@@ -1,0 +1,37 @@
+"""Fixtures of all tests: the same examples of Hypothesis in every run, and a hub with a client."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+from hypothesis import HealthCheck, settings
+
+from common.bus import open_client, open_hub
+from tests.helpers import free_endpoint
+
+settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("repeatable")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """A loopback endpoint that nobody listens on yet."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def hub(endpoint: str) -> Iterator[zenoh.Session]:
+    """A hub that listens on `endpoint`."""
+    with open_hub(endpoint) as session:
+        yield session
+
+
+@pytest.fixture
+def client(endpoint: str, hub: zenoh.Session) -> Iterator[zenoh.Session]:
+    """A client of `hub`."""
+    with open_client(endpoint, patience=10.0) as session:
+        yield session

@@ -1,0 +1,71 @@
+"""Small things that several tests need: free ports, waiting with a deadline, episodes to send about."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from common.config import Config
+from common.messages import Ending, Episode, Version
+from common.observation import ACTION_SIZE, ObservationLayout
+from common.tasks import Task
+
+
+def free_port() -> int:
+    """A TCP port on loopback that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def free_endpoint() -> str:
+    """A Zenoh endpoint on loopback that nobody listens on."""
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+def wait_until(condition: Callable[[], Any], timeout: float = 10.0, what: str = "the condition") -> Any:
+    """The first true value of `condition`, polled every 5 ms; fails after `timeout` s."""
+    deadline = time.monotonic() + timeout
+    while not (value := condition()):
+        if time.monotonic() > deadline:
+            raise AssertionError(f"{what} did not come true within {timeout} s")
+        time.sleep(0.005)
+    return value
+
+
+def tiny_episode(
+    config: Config,
+    steps: int = 3,
+    seed: int = 0,
+    ending: Ending = "timeout",
+    digest: dict[str, str] | None = None,
+    cell: int = 0,
+    version: Version | None = None,
+) -> Episode:
+    """A well-formed episode of `steps` random transitions in the layout of `config`."""
+    layout, rng, rows = ObservationLayout.of(config), np.random.default_rng(seed), steps + 1
+    shape = (rows, *layout.row_shape)
+    if layout.row_dtype == "uint8":
+        visual: np.ndarray = rng.integers(0, 256, shape, dtype=np.uint8)
+    else:
+        visual = rng.uniform(0, 2, shape).astype(np.float16)
+    action = rng.uniform(-1, 1, (rows, ACTION_SIZE)).astype(np.float32)
+    reward = rng.uniform(-1, 0, rows).astype(np.float32)
+    action[-1], reward[-1] = 0, 0
+    version = version or Version(epoch=1, counter=seed)
+    return Episode(
+        digest=digest if digest is not None else {"protocol": "1"},
+        task=Task(cell=cell, seed=seed, start=config.world.start),
+        visual=visual,
+        lidar=rng.uniform(0, 1, (rows, layout.lidar)).astype(np.float16),
+        action=action,
+        reward=reward,
+        ending=ending,
+        first_version=version,
+        last_version=version,
+        category="random",
+    )

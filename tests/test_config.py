@@ -1,0 +1,370 @@
+import math
+import tomllib
+from functools import reduce
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.config import (
+    Config,
+    StartRanges,
+    differing_key,
+    known_keys,
+    override,
+    parse,
+    resolve,
+    validate,
+)
+from common.errors import UsageError
+
+PRESETS = ("paper", "fast", "smoke")
+VARIANTS = ("navacl-q", "rnd", "e2e")
+
+TASK = {  # facts.md, section 1: the same in every preset
+    "world.control_period": 0.180,
+    "world.robot.length": 1.273,
+    "world.robot.width": 0.630,
+    "world.robot.height": 0.300,
+    "world.robot.max_speed": 1.2,
+    "world.dolly.length": 1.230,
+    "world.dolly.width": 0.820,
+    "world.dolly.underside": 0.34,
+    "world.dolly.leg": 0.040,
+    "world.dolly.rail_height": 0.10,
+    "world.camera.size": 80,
+    "world.camera.fov": 47.0,
+    "world.lidar.beams": 128,
+    "world.lidar.fov": 225.0,
+    "world.lidar.range": 6.0,
+    "world.lidar.height": 0.20,
+    "world.reward.step": -0.1,
+    "world.reward.slow": -0.05,
+    "world.reward.slow_speed": 0.3,
+    "world.reward.dolly_contact": -0.1,
+    "world.reward.other_contact": -10.0,
+    "world.reward.success": 10.0,
+    "world.reward.success_distance": 0.3,
+    "world.start.distance_min": 1.5,
+    "world.start.distance_max": 5.0,
+    "world.start.yaw": 90.0,
+    "world.start.bearing": 15.0,
+    "world.start.dolly_yaw": 15.0,
+    "world.obstacles.count_min": 1,
+    "world.obstacles.count_max": 4,
+    "world.obstacles.distance_min": 2.0,
+    "world.obstacles.distance_max": 5.0,
+    "world.randomize_appearance": True,
+}
+PAPER = {  # facts.md, sections 2 and 3
+    "world.max_episode_steps": 100,
+    "world.max_evaluation_steps": 200,
+    "encoder.kind": "residual",
+    "encoder.frames_per_code": 4,
+    "encoder.channels": (16, 16, 32, 32),
+    "encoder.end_to_end": False,
+    "network.lidar_branch": (64, 32),
+    "network.history_branch": (8,),
+    "network.hidden": (256, 256),
+    "network.layer_norm": False,
+    "sac.gamma": 0.999,
+    "sac.learning_rate": 2e-4,
+    "sac.batch_size": 64,
+    "sac.n_step": 1,
+    "sac.target": "hard",
+    "sac.target_interval": 1000,
+    "sac.policy_delay": 1,
+    "sac.initial_alpha": 0.2,
+    "sac.alpha_floor": 0.0,
+    "sac.target_entropy": -2.0,
+    "replay.capacity": 2**20,
+    "replay.priority_exponent": 0.6,
+    "replay.importance_start": 0.4,
+    "replay.importance_end": 0.6,
+    "replay.importance_steps": 5_000_000,
+    "replay.warmup_steps": 15_000,
+    "learner.updates_per_step": 0.25,
+    "learner.snapshot_steps": 25_000,
+    "actor.worlds": 9,
+    "actor.refresh": "episode",
+    "curriculum.algorithm": "navacl-q",
+    "curriculum.beta": 1.0,
+    "curriculum.gamma": 0.1,
+    "curriculum.chi": 0.95,
+    "curriculum.max_draws": 100,
+    "curriculum.filter_samples": 100,
+    "curriculum.batch_size": 16,
+    "curriculum.learning_rate": 4e-4,
+    "curriculum.hidden": (32, 32),
+    "curriculum.fit_steps": 1,
+    "curriculum.random_limit": 0.15,
+    "curriculum.random_steps": 1e6,
+    "curriculum.narrowed_candidates": 0.0,
+    "curriculum.gate.enabled": False,
+}
+
+
+def value(config: Config, key: str) -> object:
+    return reduce(getattr, key.split("."), config)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_resolves_with_every_variant(preset, variant):
+    config = resolve(preset, variant=variant, seed=4)
+    assert (config.preset, config.variant, config.seed) == (preset, variant, 4)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("key", TASK)
+def test_the_task_is_the_papers_in_every_preset(preset, key):
+    assert value(resolve(preset), key) == TASK[key]
+
+
+@pytest.mark.parametrize("key", PAPER)
+def test_paper_preset_has_the_papers_number(key):
+    assert value(resolve("paper"), key) == PAPER[key]
+
+
+def test_fast_is_the_default_and_equals_the_defaults():
+    assert resolve() == resolve("fast") == Config()
+    assert resolve().curriculum.algorithm == "navacl-q+"
+    assert resolve().encoder.frames_per_code == 1
+
+
+def test_smoke_preset_is_small():
+    config = resolve("smoke")
+    assert config.world.max_episode_steps == 20
+    assert config.actor.worlds == 2
+    assert config.replay.warmup_steps == 100
+
+
+def test_variants_change_the_curriculum_or_the_encoder():
+    rnd, e2e = resolve("paper", variant="rnd"), resolve("paper", variant="e2e")
+    assert (rnd.curriculum.algorithm, rnd.curriculum.gate.enabled) == ("rnd", False)
+    assert not resolve(variant="rnd").curriculum.gate.enabled
+    assert e2e.encoder.end_to_end
+    assert e2e.curriculum.algorithm == "navacl-q"
+
+
+def test_later_sources_win(tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text("[sac]\nbatch_size = 32\nlearning_rate = 1e-3\n")
+    assert resolve().sac.batch_size == 128
+    assert resolve("paper").sac.batch_size == 64
+    config = resolve("paper", file, ("sac.learning_rate=0.5",))
+    assert config.sac.batch_size == 32
+    assert config.sac.learning_rate == 0.5
+    assert config.sac.gamma == 0.999
+
+
+def test_later_overrides_win_and_the_seed_argument_beats_the_file(tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text("seed = 5\n")
+    assert resolve(file=file).seed == 5
+    assert resolve(file=file, seed=6).seed == 6
+    assert resolve(file=file, seed=6, overrides=("seed=7", "seed=8")).seed == 8
+
+
+def test_preset_and_variant_named_in_the_file_apply_unless_given(tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text('preset = "paper"\nvariant = "rnd"\n')
+    config = resolve(file=file)
+    assert (config.preset, config.variant) == ("paper", "rnd")
+    assert config.sac.gamma == 0.999
+    assert config.curriculum.algorithm == "rnd"
+    assert resolve("smoke", file).preset == "smoke"
+
+
+def test_file_of_a_run_resolves_to_the_same_configuration(tmp_path):
+    config = resolve("paper", variant="e2e", overrides=("actor.worlds=3",), seed=11)
+    file = tmp_path / "config.toml"
+    file.write_text(config.to_toml())
+    assert resolve(file=file) == config
+
+
+@pytest.mark.parametrize(
+    ("setting", "nearest"),
+    [
+        ("sac.gama=0.9", "sac.gamma"),
+        ("world.robot.lenght=1.0", "world.robot.length"),
+        ("replays=3", "replay"),
+        ("curriculum.gate.window_=3", "curriculum.gate.window"),
+        ("encoder.chanels=[1,2,3,4]", "encoder.channels"),
+    ],
+)
+def test_unknown_key_is_named_with_the_nearest_known_one(setting, nearest):
+    key = setting.split("=")[0]
+    with pytest.raises(UsageError) as caught:
+        resolve(overrides=(setting,))
+    assert str(caught.value) == f"config key {key!r} does not exist; the nearest key is {nearest!r}"
+
+
+def test_unknown_key_of_a_file_is_refused_too(tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text("[actor]\nworld = 3\n")
+    with pytest.raises(
+        UsageError, match=r"'actor\.world' does not exist; the nearest key is 'actor\.worlds'"
+    ):
+        resolve(file=file)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("sac.gamma=1.5", r"'sac\.gamma' = 1\.5.*less than 1"),
+        ("sac.gamma=nan", r"'sac\.gamma'.*finite number"),
+        ("sac.learning_rate=0", r"'sac\.learning_rate' = 0.*greater than 0"),
+        ("sac.batch_size=lots", r"'sac\.batch_size' = 'lots'.*integer"),
+        ("sac.batch_size=1.5", r"'sac\.batch_size' = 1\.5.*integer"),
+        ("sac.target=medium", r"'sac\.target' = 'medium'.*'soft' or 'hard'"),
+        ("encoder.frames_per_code=2", r"'encoder\.frames_per_code' = 2.*1 or 4"),
+        ("encoder.channels=[1,2,3]", r"'encoder\.channels\.3'.*required"),
+        ("world.camera.size=81", r"'world\.camera\.size' = 81.*multiple of 16"),
+        ("world.start.distance_max=1.0", r"'world\.start'.*distance_min <= distance_max"),
+        ("world.start.distance_max=6.0", r"'world\.start'.*<= 5 m"),
+        ("world.obstacles.count_min=5", r"'world\.obstacles'.*count_min <= count_max"),
+        ("world.obstacles.distance_min=6", r"'world\.obstacles'.*distance_min <= distance_max"),
+        ("actor.worlds=0", r"'actor\.worlds' = 0.*greater than or equal to 1"),
+        ("sac=3", r"'sac' = 3"),
+        ("sac.gamma.x=1", r"'sac\.gamma'.*valid number"),
+        ("seed=-1", r"'seed' = -1"),
+    ],
+)
+def test_bad_value_is_named_with_its_key_and_reason(setting, said):
+    with pytest.raises(UsageError, match=said):
+        resolve(overrides=(setting,))
+
+
+@pytest.mark.parametrize("setting", ["sac.gamma", "=3", ""])
+def test_override_without_key_and_value_is_refused(setting):
+    with pytest.raises(UsageError, match=r"must have the form section\.key=value"):
+        resolve(overrides=(setting,))
+
+
+@pytest.mark.parametrize("setting", ["preset=paper", "variant=rnd"])
+def test_override_cannot_relabel_the_preset_or_the_variant(setting):
+    key, _, name = setting.partition("=")
+    with pytest.raises(UsageError, match=f"cannot change the {key}; use --{key} {name}"):
+        resolve(overrides=(setting,))
+
+
+@pytest.mark.parametrize(
+    ("setting", "key", "expected"),
+    [
+        ("sac.target=hard", "sac.target", "hard"),
+        ('sac.target="hard"', "sac.target", "hard"),
+        ("encoder.end_to_end=true", "encoder.end_to_end", True),
+        ("network.lidar_branch=[7, 5]", "network.lidar_branch", (7, 5)),
+        ("curriculum.gate={enabled=false, window=5}", "curriculum.gate.window", 5),
+        ("world.reward.dolly_contact=-10", "world.reward.dolly_contact", -10.0),
+        ("replay.capacity=1_000", "replay.capacity", 1000),
+    ],
+)
+def test_override_takes_toml_values_and_bare_words(setting, key, expected):
+    assert value(resolve(overrides=(setting,)), key) == expected
+
+
+def test_override_of_one_key_leaves_its_neighbours():
+    config = resolve("paper", overrides=("curriculum.gate.window=5",))
+    assert config.curriculum.gate.window == 5
+    assert not config.curriculum.gate.enabled
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"preset": "papers"}, "preset 'papers' does not exist; choose one of paper, fast, smoke"),
+        ({"variant": "x"}, "variant 'x' does not exist; choose one of navacl-q, rnd, e2e"),
+    ],
+)
+def test_unknown_preset_and_variant_are_usage_errors(arguments, said):
+    with pytest.raises(UsageError) as caught:
+        resolve(**arguments)
+    assert str(caught.value) == said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a = [", "is not TOML"),
+        ("variant = [1]", "variant [1] does not exist"),
+        ("preset = {a = 1}", "preset {'a': 1} does not exist"),
+    ],
+)
+def test_unusable_file_is_a_usage_error(tmp_path, text, said):
+    file = tmp_path / "bad.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError) as caught:
+        resolve(file=file)
+    assert said in str(caught.value)
+
+
+def test_missing_and_binary_files_are_usage_errors(tmp_path):
+    with pytest.raises(UsageError, match=r"cannot read the configuration .*none\.toml: No such file"):
+        resolve(file=tmp_path / "none.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(UsageError, match="is not TOML"):
+        resolve(file=tmp_path / "binary.toml")
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_toml_round_trip_is_exact_and_complete(preset, variant):
+    config = resolve(preset, variant=variant, seed=3)
+    assert parse(config.to_toml()) == config
+    assert tomllib.loads(config.to_toml()) == config.model_dump(mode="json")
+
+
+@given(
+    st.floats(1e-9, 1 - 1e-9), st.floats(1e-12, 1e6), st.lists(st.integers(1, 999), max_size=4), st.booleans()
+)
+def test_toml_round_trip_keeps_floats_to_the_bit(gamma, rate, branch, gate):
+    config = validate(
+        {
+            "sac": {"gamma": gamma, "learning_rate": rate},
+            "network": {"lidar_branch": branch},
+            "curriculum": {"gate": {"enabled": gate}},
+        }
+    )
+    assert parse(config.to_toml()) == config
+    assert parse(config.to_toml()).sac.learning_rate == rate
+
+
+def test_parse_refuses_what_is_not_toml():
+    with pytest.raises(UsageError, match="the configuration is not TOML"):
+        parse("][")
+
+
+def test_configuration_is_frozen_in_depth():
+    config = Config()
+    with pytest.raises(ValueError, match="frozen"):
+        config.sac.gamma = 0.5
+    assert config.sac.gamma == 0.98
+
+
+def test_override_leaves_the_given_values_alone():
+    values = {"sac": {"gamma": 0.5}}
+    assert override(values, ("sac.gamma=0.6",)).sac.gamma == 0.6
+    assert values == {"sac": {"gamma": 0.5}}
+
+
+def test_known_keys_are_dotted_and_hold_sections_and_leaves():
+    keys = known_keys()
+    assert len(keys) == len(set(keys))
+    assert {"seed", "world", "world.start.yaw", "curriculum.gate.ranges.dolly_yaw"} <= set(keys)
+    assert set(TASK) | set(PAPER) <= set(keys)
+
+
+def test_differing_key_is_the_first_one_with_both_values():
+    ours = resolve(overrides=("world.robot.track=0.4", "sac.gamma=0.5"))
+    assert differing_key(ours, Config()) == ("world.robot.track", 0.4, 0.5)
+    assert differing_key(ours, Config(), ("sac", "replay")) == ("sac.gamma", 0.5, 0.98)
+    assert differing_key(ours, Config(), ("replay",)) is None
+    assert differing_key(Config(), Config()) is None
+
+
+def test_ranges_refuse_what_no_cell_has_room_for():
+    for bad in ({"distance_min": 0.0}, {"yaw": 181.0}, {"bearing": 16.0}, {"yaw": math.inf}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            StartRanges(**bad)

@@ -1,0 +1,337 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.distributions import Independent, Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+
+from common.config import resolve
+from common.networks import (
+    LOG_STD_MAX,
+    LOG_STD_MIN,
+    Encoder,
+    Policy,
+    TwinCritic,
+    compile_encoder,
+    flatten,
+    initial_q,
+    load_state,
+    make_encoder,
+    state_of,
+)
+from common.observation import Columns, ObservationLayout, observe
+
+PRESETS = ("paper", "fast", "smoke")
+
+
+def policy_with(mean: list[float], log_std: list[float]) -> tuple[Policy, torch.Tensor]:
+    """A policy whose distribution is the same everywhere, and an observation for it."""
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    policy = Policy(layout, config.network)
+    squashed = [(x - LOG_STD_MIN) / (LOG_STD_MAX - LOG_STD_MIN) * 2 - 1 for x in log_std]
+    with torch.no_grad():
+        policy.net.output.weight.zero_()
+        policy.net.output.bias.copy_(torch.tensor([*mean, *map(math.atanh, squashed)]))
+    return policy, torch.zeros(1, layout.size)
+
+
+def linear_sizes(module: nn.Module) -> list[tuple[int, int]]:
+    return [(m.in_features, m.out_features) for m in module.modules() if isinstance(m, nn.Linear)]
+
+
+def test_paper_encoder_gives_5_by_5_by_32_features_for_a_stack_of_80_by_80():
+    encoder = make_encoder(resolve("paper"))
+    frames = torch.rand(2, 12, 80, 80)
+    assert encoder.blocks(frames).shape == (2, 32, 5, 5)
+    assert encoder(frames).shape == (2, 800)
+
+
+def test_paper_encoder_has_four_blocks_with_the_identity_concatenated():
+    encoder = make_encoder(resolve("paper"))
+    kernels = [
+        (m.in_channels, m.out_channels, m.kernel_size, m.stride)
+        for m in encoder.modules()
+        if isinstance(m, nn.Conv2d)
+    ]
+    expected = []
+    for a, b in ((12, 16), (16, 16), (16, 32), (32, 32)):
+        expected += [(a, b, (3, 3), (1, 1)), (b, b, (3, 3), (1, 1)), (a + b, b, (2, 2), (2, 2))]
+    assert kernels == expected
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_encoder_gives_the_code_that_the_layout_promises(preset):
+    config = resolve(preset)
+    layout = ObservationLayout.of(config)
+    code = make_encoder(config)(torch.rand(1, 3 * config.encoder.frames_per_code, 80, 80))
+    assert code.shape == (1, *layout.row_shape)
+    assert layout.stack * code.shape[1] == layout.visual
+
+
+def test_encoder_starts_from_the_seed_and_leaves_the_global_generator_alone():
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    a, b = make_encoder(resolve(seed=3)), make_encoder(resolve(seed=3))
+    other = make_encoder(resolve(seed=4))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    for key, value in a.state_dict().items():
+        assert torch.equal(value, b.state_dict()[key])
+    assert not torch.equal(a.state_dict()["blocks.0.0.weight"], other.state_dict()["blocks.0.0.weight"])
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_compiled_encoder_equals_torch_within_float16_for_any_batch(preset):
+    config = resolve(preset)
+    encoder, frames_per_code = make_encoder(config), config.encoder.frames_per_code
+    compiled = compile_encoder(encoder, 80)
+    rng = np.random.default_rng(0)
+    for batch in (1, 5):
+        frames = rng.integers(0, 256, (batch, frames_per_code, 80, 80, 3), dtype=np.uint8)
+        channels = [frames[:, f, :, :, c] for f in range(frames_per_code) for c in range(3)]
+        scaled = torch.from_numpy(np.stack(channels, axis=1).astype(np.float32) / 255)
+        with torch.no_grad():
+            expected = encoder(scaled).numpy()
+        codes = compiled(frames)
+        assert codes.dtype == np.float16
+        np.testing.assert_allclose(codes, expected, rtol=1e-3, atol=1e-4)
+        assert expected.std() > 0.01
+
+
+def test_codes_do_not_depend_on_the_batch_they_are_computed_in():
+    config = resolve("fast")
+    compiled = compile_encoder(make_encoder(config), 80)
+    frames = np.random.default_rng(1).integers(0, 256, (6, 1, 80, 80, 3), dtype=np.uint8)
+    together = compiled(frames)
+    alone = np.concatenate([compiled(frames[i : i + 1]) for i in range(6)])
+    np.testing.assert_allclose(together, alone, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("frames_per_code", [1, 4])
+def test_stacks_encoded_end_to_end_equal_the_codes_of_their_frames(frames_per_code):
+    config = resolve("smoke", overrides=(f"encoder.frames_per_code={frames_per_code}",))
+    encoder, compiled = make_encoder(config), compile_encoder(make_encoder(config), 80)
+    stacks = np.random.default_rng(2).integers(0, 256, (3, 4, 80, 80, 3), dtype=np.uint8)
+    with torch.no_grad():
+        codes = encoder.encode_stacks(torch.from_numpy(stacks)).numpy()
+    assert codes.shape == (3, ObservationLayout.of(config).visual)
+    for b in range(3):
+        parts = compiled(stacks[b].reshape(-1, frames_per_code, 80, 80, 3)).reshape(-1)
+        np.testing.assert_allclose(codes[b], parts, rtol=1e-3, atol=1e-4)
+
+
+def test_encoder_trained_end_to_end_receives_gradients_through_flatten():
+    config = resolve("smoke", variant="e2e")
+    layout, encoder = ObservationLayout.of(config), make_encoder(config)
+    columns = Columns.empty(3, layout)
+    columns.visual[:] = np.random.default_rng(0).integers(0, 256, columns.visual.shape)
+    flat = flatten(observe(columns, np.array([1, 2]), np.array([0, 0]), layout), encoder)
+    assert flat.shape == (2, layout.size)
+    flat.sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in encoder.parameters())
+
+
+def test_flat_vector_is_visual_then_lidar_then_history():
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    columns = Columns.empty(4, layout)
+    columns.visual[:] = np.arange(4)[:, None]
+    columns.lidar[:], columns.action[:], columns.reward[:] = 0.5, 0.25, -1
+    flat = flatten(observe(columns, np.array([3]), np.array([0]), layout))
+    assert flat.dtype == torch.float32
+    visual, lidar, history = flat[0].split([layout.visual, layout.lidar, layout.history])
+    assert visual.reshape(4, -1)[:, 0].tolist() == [0, 1, 2, 3]
+    assert (lidar == 0.5).all()
+    assert history.tolist() == [0, 0, 0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0, -1, -1, -1]
+
+
+def test_paper_networks_have_the_papers_branches_and_differ_in_the_output_layer_only():
+    config = resolve("paper")
+    layout = ObservationLayout.of(config)
+    policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
+    assert linear_sizes(policy.net.lidar_branch) == [(256, 64), (64, 32)]
+    assert linear_sizes(policy.net.history_branch) == [(12, 8)]
+    assert linear_sizes(policy.net.head) == [(800 + 32 + 8, 256), (256, 256)]
+    assert linear_sizes(policy.net.output) == [(256, 4)]
+    assert len(critic.critics) == 2
+    for net in critic.critics:
+        assert linear_sizes(net.lidar_branch) == [(256, 64), (64, 32)]
+        assert linear_sizes(net.history_branch) == [(12, 8)]
+        assert linear_sizes(net.head) == [(800 + 32 + 8 + 2, 256), (256, 256)]
+        assert linear_sizes(net.output) == [(256, 1)]
+    assert not any(isinstance(m, nn.LayerNorm) for m in (*policy.modules(), *critic.modules()))
+
+
+def test_fast_networks_pass_lidar_and_history_through_and_normalise_the_critics():
+    config = resolve("fast")
+    layout = ObservationLayout.of(config)
+    policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
+    assert linear_sizes(policy.net)[0] == (800 + 256 + 12, 256)
+    assert not any(isinstance(m, nn.LayerNorm) for m in policy.modules())
+    assert sum(isinstance(m, nn.LayerNorm) for m in critic.modules()) == 4
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_part_of_the_observation_and_the_action_reach_the_output(preset):
+    torch.manual_seed(0)
+    config = resolve(preset)
+    layout = ObservationLayout.of(config)
+    policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
+    flat, action = torch.rand(1, layout.size, requires_grad=True), torch.zeros(1, 2, requires_grad=True)
+    (critic(flat, action).sum() + sum(part.sum() for part in policy(flat))).backward()
+    parts = flat.grad[0].split([layout.visual, layout.lidar, layout.history])
+    assert all(part.abs().sum() > 0 for part in parts)
+    assert (action.grad != 0).all()
+
+
+def test_twin_critics_give_two_independent_values_per_observation():
+    torch.manual_seed(0)
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    critic = TwinCritic(layout, config.network)
+    q = critic(torch.rand(5, layout.size), torch.zeros(5, 2))
+    assert q.shape == (2, 5)
+    assert not torch.allclose(q[0], q[1])
+
+
+def test_initial_q_is_the_lesser_critic_at_the_greedy_action():
+    torch.manual_seed(1)
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
+    flat = torch.rand(64, layout.size) * 3
+    with torch.no_grad():
+        a, b = critic(flat, torch.tanh(policy(flat)[0]))
+    found = initial_q(policy, critic, flat)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, torch.minimum(a, b).numpy(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mean", "log_std"), [([0.0, 0.0], [-0.7, 0.0]), ([0.8, -1.3], [0.3, -2.0]), ([-2.0, 2.0], [1.0, -4.5])]
+)
+def test_policy_log_density_is_that_of_a_gaussian_through_tanh(mean, log_std):
+    policy, flat = policy_with(mean, log_std)
+    noise = torch.randn(200, 2, generator=torch.Generator().manual_seed(0))
+    action, log_density = policy.sample(flat.expand(200, -1), noise)
+    scale = torch.tensor(log_std, dtype=torch.float64).exp()
+    raw = torch.tensor(mean, dtype=torch.float64) + scale * noise
+    squash = TanhTransform(cache_size=1)  # the cache spares the reference an atanh close to 1
+    expected_action = squash(raw)
+    gaussian = Normal(torch.tensor(mean, dtype=torch.float64), scale)
+    reference = Independent(TransformedDistribution(gaussian, squash), 1)
+    torch.testing.assert_close(action.double(), expected_action, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        log_density.double(), reference.log_prob(expected_action), rtol=1e-4, atol=1e-4
+    )
+
+
+def test_policy_log_density_by_hand():
+    policy, flat = policy_with([0.5, 0.0], [math.log(0.5), math.log(2.0)])
+    action, log_density = policy.sample(flat, torch.tensor([[1.0, 0.25]]))
+    assert action[0].tolist() == pytest.approx([math.tanh(1.0), math.tanh(0.5)], abs=1e-6)
+    gaussian = [
+        math.exp(-0.5) / (0.5 * math.sqrt(2 * math.pi)),
+        math.exp(-0.03125) / (2 * math.sqrt(2 * math.pi)),
+    ]
+    slopes = [1 - math.tanh(1.0) ** 2, 1 - math.tanh(0.5) ** 2]
+    density = gaussian[0] / slopes[0] * gaussian[1] / slopes[1]
+    assert log_density.item() == pytest.approx(math.log(density), abs=1e-5)
+
+
+def test_policy_density_integrates_to_one_over_the_square_of_actions():
+    policy, flat = policy_with([0.4, -0.3], [-0.5, -0.8])
+    mean, log_std = (part[0].detach() for part in policy(flat))
+    edge = np.linspace(-1, 1, 401)
+    grid = torch.tensor((edge[:-1] + edge[1:]) / 2, dtype=torch.float32)
+    action = torch.cartesian_prod(grid, grid)
+    noise = (torch.atanh(action) - mean) / log_std.exp()
+    _, log_density = policy.sample(flat.expand(len(action), -1), noise)
+    total = log_density.detach().double().exp().sum().item() * (2 / 400) ** 2
+    assert total == pytest.approx(1.0, abs=2e-3)
+
+
+def test_policy_log_density_stays_finite_where_tanh_saturates():
+    policy, flat = policy_with([30.0, -30.0], [0.0, 0.0])
+    action, log_density = policy.sample(flat, torch.zeros(1, 2))
+    assert action.tolist() == [[1.0, -1.0]]
+    # log N(0) - log(4 exp(-2 |raw|)) per dimension
+    expected = 2 * (-0.5 * math.log(2 * math.pi) - math.log(4) + 60)
+    assert log_density.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_log_standard_deviation_stays_within_its_limits():
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    policy = Policy(layout, config.network)
+    with torch.no_grad():
+        policy.net.output.bias[2:] = torch.tensor([1e6, -1e6])
+    _, log_std = policy(torch.zeros(1, layout.size))
+    assert log_std[0].tolist() == pytest.approx([2.0, -5.0])
+
+
+def test_greedy_action_is_the_squashed_mean():
+    policy, flat = policy_with([0.7, -0.2], [0.0, 0.0])
+    assert policy.mode(flat)[0].tolist() == pytest.approx([math.tanh(0.7), math.tanh(-0.2)], abs=1e-6)
+
+
+def test_sample_is_differentiable_through_mean_and_deviation():
+    torch.manual_seed(0)
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    policy = Policy(layout, config.network)
+    action, log_density = policy.sample(torch.rand(4, layout.size), torch.ones(4, 2))
+    (action.sum() + log_density.sum()).backward()
+    assert (policy.net.output.bias.grad != 0).all()
+
+
+def test_state_is_loaded_back_under_its_names():
+    torch.manual_seed(0)
+    config = resolve("smoke")
+    layout = ObservationLayout.of(config)
+    source, target = Policy(layout, config.network), Policy(layout, config.network)
+    critic = TwinCritic(layout, config.network)
+    state = state_of(policy=source, critic=critic)
+    assert "policy.net.output.weight" in state
+    assert "critic.critics.1.output.bias" in state
+    flat = torch.rand(3, layout.size)
+    assert not torch.equal(source.mode(flat), target.mode(flat))
+    load_state(state, policy=target)
+    assert torch.equal(source.mode(flat), target.mode(flat))
+
+
+def test_loaded_state_is_a_copy():
+    encoder, other = Encoder(resolve("smoke").encoder), Encoder(resolve("smoke").encoder)
+    state = state_of(encoder=encoder)
+    load_state(state, encoder=other)
+    with torch.no_grad():
+        next(encoder.parameters()).zero_()
+    assert next(other.parameters()).abs().sum() > 0
+
+
+def test_missing_and_misshapen_tensors_are_named():
+    encoder = make_encoder(resolve("smoke"))
+    state = state_of(encoder=encoder)
+    without = {key: value for key, value in state.items() if key != "encoder.blocks.1.down.bias"}
+    with pytest.raises(
+        ValueError, match=r"tensor encoder\.blocks\.1\.down\.bias is missing, expected shape \(8,\)"
+    ):
+        load_state(without, encoder=encoder)
+    wrong = {**state, "encoder.blocks.0.0.weight": torch.zeros(8, 3, 2, 2)}
+    with pytest.raises(
+        ValueError,
+        match=r"encoder\.blocks\.0\.0\.weight is of shape \(8, 3, 2, 2\), expected shape \(8, 3, 4, 4\)",
+    ):
+        load_state(wrong, encoder=encoder)
+
+
+def test_nothing_is_loaded_from_a_state_of_which_one_tensor_does_not_fit():
+    encoder = make_encoder(resolve("smoke"))
+    before = {key: value.clone() for key, value in encoder.state_dict().items()}
+    state = {key: torch.zeros_like(value) for key, value in state_of(encoder=encoder).items()}
+    state.popitem()
+    with pytest.raises(ValueError, match="is missing"):
+        load_state(state, encoder=encoder)
+    assert all(torch.equal(value, before[key]) for key, value in encoder.state_dict().items())
