@@ -34,7 +34,8 @@ class Examiner:
         slots = min(len(CELLS), CHUNK)
         self._actor = PolicyActor(config, slots, np.random.default_rng([seed, 4]), greedy)
         try:
-            load_state(tensors, encoder=encoder)
+            if not config.encoder.end_to_end:
+                load_state(tensors, encoder=encoder)
             self._actor.load(Version(), tensors)
         except ValueError as error:
             raise UsageError(f"{policy} holds other networks than its configuration says: {error}") from None

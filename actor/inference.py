@@ -12,7 +12,7 @@ from torch import Tensor
 
 from common.config import Config
 from common.messages import Version
-from common.networks import Encoder, Policy, compile_encoder, flatten, load_state, make_encoder
+from common.networks import Encoder, Perception, Policy, compile_encoder, load_state
 from common.observation import HISTORY, Observation, ObservationLayout
 
 
@@ -26,15 +26,17 @@ class Actor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LoadedPolicy:
-    """A policy as of one version of the weights; `encoder` only when it trains end to end."""
+    """A policy as of one version of the weights."""
 
     version: Version
+    perception: Perception
     policy: Policy
-    encoder: Encoder | None
 
 
 class PolicyActor:
     """The SAC policy on the CPU; samples its actions, or with `greedy` takes the mean's.
+
+    Before the first update of the weights it samples uniformly, which covers more than an untrained policy.
 
     Every slot drives with the weights that were newest when it was last refreshed, so that an episode can
     keep one policy to its end (algorithm 2).
@@ -46,16 +48,13 @@ class PolicyActor:
         self._in_slot = [self.newest] * slots
 
     def _blank(self, version: Version) -> LoadedPolicy:
-        encoder = make_encoder(self._config).eval() if self._config.encoder.end_to_end else None
-        layout = ObservationLayout.of(self._config)
-        return LoadedPolicy(version, Policy(layout, self._config.network).eval(), encoder)
+        policy = Policy(ObservationLayout.of(self._config), self._config.network)
+        return LoadedPolicy(version, Perception(self._config).eval(), policy.eval())
 
     def load(self, version: Version, tensors: dict[str, Tensor]) -> None:
         """Makes these weights the newest; ValueError when they do not fit."""
         loaded = self._blank(version)
-        load_state(tensors, policy=loaded.policy)
-        if loaded.encoder is not None:
-            load_state(tensors, encoder=loaded.encoder)
+        load_state(tensors, perception=loaded.perception, policy=loaded.policy)
         self.newest = loaded
 
     def refresh(self, slot: int) -> None:
@@ -73,8 +72,11 @@ class PolicyActor:
         loaded = [self._in_slot[slot] for slot in slots]
         for one in {id(item): item for item in loaded}.values():
             mine = np.array([item is one for item in loaded])
+            if not self._greedy and one.version.counter == 0:
+                actions[mine] = self._rng.uniform(-1, 1, (mine.sum(), 2))
+                continue
             with torch.inference_mode():
-                flat = flatten(Observation(*(part[mine] for part in observation)), one.encoder)
+                flat = one.perception(Observation(*(part[mine] for part in observation)))
                 if self._greedy:
                     chosen = one.policy.mode(flat)
                 else:

@@ -1,4 +1,4 @@
-"""The actor process: asks the curriculum for tasks, drives the worlds, ships episodes, outcomes, candidates."""
+"""The actor process: asks for tasks, drives the worlds, ships episodes, outcomes and candidates."""
 
 from __future__ import annotations
 
@@ -165,7 +165,8 @@ class ActorService:
                 category=category,
             )
             self._reports.put(self.keys.result, outcome)
-        self._look(slot)
+        if proposal is not None and proposal.f is not None:
+            self._look(slot)  # in place of the candidate that this episode used up
         self._ask(slot)
 
     def _look(self, slot: int) -> None:

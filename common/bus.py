@@ -168,7 +168,7 @@ class QueryServer:
             try:
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 attachment = query.attachment.to_bytes() if query.attachment is not None else b""
-                answer = self._handler(payload, attachment)
+                answer = zenoh.ZBytes(self._handler(payload, attachment))
             except MessageError as error:
                 self._refuse(query, str(error))
             except Exception:

@@ -195,15 +195,71 @@ class TwinCritic(nn.Module):
         return torch.stack([critic(flat, action).squeeze(-1) for critic in self.critics])
 
 
-def flatten(observation: Observation, encoder: Encoder | None = None) -> Tensor:
-    """The vector [visual, lidar, actions, rewards] (B, layout.size) float32.
+class Normalizer(nn.Module):
+    """Running mean and variance of each feature, over all batches that it was shown."""
 
-    `visual` holds codes, or frames when an `encoder` that trains end to end is given.
+    mean: Tensor
+    variance: Tensor
+    count: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+        self.register_buffer("count", torch.zeros(()))
+
+    def update(self, batch: Tensor) -> None:
+        """Merges a batch (B, size) into the statistics (Chan et al. 1979)."""
+        share = len(batch) / (self.count + len(batch))
+        shift = batch.mean(0) - self.mean
+        self.variance.lerp_(batch.var(0, correction=0) + (1 - share) * shift**2, share)
+        self.mean += share * shift
+        self.count += len(batch)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, size) -> (B, size), centred, scaled and cut at 5 standard deviations."""
+        return ((x - self.mean) * (self.variance + 1e-4).rsqrt()).clamp(-5.0, 5.0)
+
+
+class Perception(nn.Module):
+    """From an observation to the vector [visual, lidar, actions, rewards] that policy and critics take.
+
+    Holds whatever lies between what is stored and that vector: the encoder when it trains end to end, the
+    logarithm of LiDAR distances (a centimetre matters near the dolly's legs and nowhere else) and the running
+    normalisation, which leaves learned codes alone.
     """
-    visual = torch.from_numpy(observation.visual)
-    code = encoder.encode_stacks(visual) if encoder is not None else visual.flatten(1).float()
-    lidar, history = torch.from_numpy(observation.lidar).float(), torch.from_numpy(observation.history)
-    return torch.cat([code, lidar, history], dim=1)
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        layout = ObservationLayout.of(config)
+        self.encoder = make_encoder(config) if config.encoder.end_to_end else None
+        self._log_lidar = config.network.log_lidar
+        self._fixed = layout.visual if self.encoder is not None else 0
+        self.normalizer = Normalizer(layout.size - self._fixed) if config.network.normalize else None
+
+    def _raw(self, observation: Observation) -> Tensor:
+        visual = torch.from_numpy(observation.visual)
+        code = visual.flatten(1).float() if self.encoder is None else self.encoder.encode_stacks(visual)
+        lidar = torch.from_numpy(observation.lidar).float()
+        if self._log_lidar:
+            lidar = torch.log(lidar + 0.01)
+        return torch.cat([code, lidar, torch.from_numpy(observation.history)], dim=1)
+
+    def forward(self, observation: Observation) -> Tensor:
+        """B observations -> (B, layout.size) float32."""
+        raw = self._raw(observation)
+        if self.normalizer is None:
+            return raw
+        if self._fixed == 0:
+            normalized: Tensor = self.normalizer(raw)
+            return normalized
+        return torch.cat([raw[:, : self._fixed], self.normalizer(raw[:, self._fixed :])], dim=1)
+
+    def watch(self, observation: Observation) -> None:
+        """Lets the running normalisation see a batch."""
+        if self.normalizer is not None:
+            with torch.no_grad():
+                self.normalizer.update(self._raw(observation)[:, self._fixed :])
 
 
 def initial_q(policy: Policy, critic: TwinCritic, flat: Tensor) -> NDArray[np.float64]:

@@ -5,7 +5,6 @@ What the learner writes as checkpoint or snapshot and what evaluation reads.
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -31,7 +30,7 @@ def save_folder(folder: Path, texts: dict[str, str], tensors: dict[str, dict[str
         save_file({key: value.detach().contiguous() for key, value in group.items()}, part / name)
     if folder.exists():
         shutil.rmtree(folder)
-    os.replace(part, folder)
+    part.replace(folder)
 
 
 def load_tensors(file: Path) -> dict[str, Tensor]:

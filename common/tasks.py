@@ -140,7 +140,7 @@ def build_scene(task: Task, world: WorldConfig) -> Scene:
         body = Rectangle(robot, world.robot.width / 2, world.robot.length / 2)
         target = Rectangle(dolly, world.dolly.width / 2, world.dolly.length / 2)
         solid = [box.footprint for box in cell.walls() + cell.fixtures]
-        if rectangles_overlap(body, target, START_MARGIN):
+        if any(rectangles_overlap(body, side, START_MARGIN) for side in dolly_sides(dolly, world)):
             continue
         if any(rectangles_overlap(shape, r, START_MARGIN) for shape in (body, target) for r in solid):
             continue
@@ -149,6 +149,17 @@ def build_scene(task: Task, world: WorldConfig) -> Scene:
             return Scene(robot, dolly, obstacles)
     raise UsageError(
         f"no free start in cell {task.cell} for distances {start.distance_min} to {start.distance_max} m"
+    )
+
+
+def dolly_sides(dolly: SE2, world: WorldConfig) -> tuple[Rectangle, Rectangle]:
+    """What a robot under the deck can touch of the dolly: its long sides, each two legs and the rail."""
+    config = world.dolly
+    x = (config.width - config.leg) / 2
+    left, right = (dolly @ SE2(sign * x) for sign in (-1, 1))
+    return (
+        Rectangle(left, config.leg / 2, config.length / 2),
+        Rectangle(right, config.leg / 2, config.length / 2),
     )
 
 
@@ -204,7 +215,8 @@ def candidate_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
     """A task for the database: `curriculum.narrowed_candidates` of them from ranges narrowed at random."""
     task = random_task(cell, config, rng)
     if rng.random() < config.curriculum.narrowed_candidates:
-        return task.model_copy(update={"start": config.world.start.narrowed(float(rng.random()))})
+        start = config.curriculum.gate.ranges.towards(config.world.start, float(rng.random()))
+        return task.model_copy(update={"start": start})
     return task
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ class SuccessNetwork:
             torch.manual_seed(seed)
             sizes = (len(self._properties) + 1, *config.hidden)
             layers: list[nn.Module] = []
-            for a, b in zip(sizes, sizes[1:], strict=False):
+            for a, b in pairwise(sizes):
                 layers += [nn.Linear(a, b), nn.ReLU()]
             self.net = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
         self._optimizer = torch.optim.Adam(self.net.parameters(), config.learning_rate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from common.config import Config
 from common.messages import Candidate, MessageError, Version
-from common.networks import Encoder, Policy, TwinCritic, flatten, initial_q, load_state, make_encoder
+from common.networks import Perception, Policy, TwinCritic, initial_q, load_state
 from common.observation import Observation, ObservationLayout
 from common.tasks import CELLS, GeometricProperties, Scene, Task, build_scene, geometric_properties
 
@@ -35,15 +36,13 @@ class CriticView:
     def __init__(self, config: Config) -> None:
         self.version: Version | None = None
         self._layout = ObservationLayout.of(config)
+        self._perception = Perception(config).eval()
         self._policy = Policy(self._layout, config.network).eval()
         self._critic = TwinCritic(self._layout, config.network).eval()
-        self._encoder: Encoder | None = make_encoder(config).eval() if config.encoder.end_to_end else None
 
     def load(self, version: Version, tensors: dict[str, Tensor]) -> None:
         """Takes newer weights; ValueError when they do not fit."""
-        load_state(tensors, policy=self._policy, critic=self._critic)
-        if self._encoder is not None:
-            load_state(tensors, encoder=self._encoder)
+        load_state(tensors, perception=self._perception, policy=self._policy, critic=self._critic)
         self.version = version
 
     def refresh(self, entries: list[Entry]) -> None:
@@ -55,7 +54,7 @@ class CriticView:
             return
         observation = self._starts([e.observed for e in stale if e.observed is not None])
         with torch.inference_mode():
-            values = initial_q(self._policy, self._critic, flatten(observation, self._encoder))
+            values = initial_q(self._policy, self._critic, self._perception(observation))
         for entry, value in zip(stale, values, strict=True):
             entry.q, entry.q_version = float(value), self.version
 
@@ -107,7 +106,5 @@ class TaskStore:
 
     def remove(self, entry: Entry) -> None:
         """Takes a candidate out, for it has been proposed."""
-        try:
+        with suppress(ValueError):
             self._cells[entry.task.cell].remove(entry)
-        except ValueError:
-            pass

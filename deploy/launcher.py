@@ -108,7 +108,7 @@ class Supervisor:
                 child.start()
 
     def stop(self) -> None:
-        """SIGTERM to all in the order actors, curriculum, learner (last added first); SIGKILL after 4 s each."""
+        """SIGTERM to all, last added first; SIGKILL to those that still run after 4 s."""
         for child in reversed(self.children):
             if child.alive and child.process:
                 child.process.send_signal(signal.SIGTERM)

@@ -138,5 +138,5 @@ def _number(values: dict[str, Value], key: str) -> str:
 
 def _mix(values: dict[str, Value], prefix: str) -> str:
     found = {k.removeprefix(prefix): float(v) for k, v in values.items() if k.startswith(prefix)}
-    order = [name for name in ENDINGS if name in found] or sorted(found)
+    order: list[str] = [name for name in ENDINGS if name in found] or sorted(found)
     return " ".join(f"{name} {100 * found[name]:.0f}%" for name in order) or "-"

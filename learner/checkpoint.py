@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -44,7 +43,8 @@ class RunDirectory:
             raise UsageError(f"{identity} is damaged") from None
         if schema != RUN_SCHEMA:
             raise UsageError(
-                f"{self.folder} was made by an incompatible version (run schema {schema}, this one has {RUN_SCHEMA})"
+                f"{self.folder} was made by an incompatible version: "
+                f"its run schema is {schema}, this version has {RUN_SCHEMA}"
             )
         config = parse((self.folder / CONFIG).read_text("utf-8"))
         if wanted is not None and (found := differing_key(wanted, config)):
@@ -108,4 +108,4 @@ def write_atomically(path: Path, text: str) -> None:
     """Replaces a small file by way of a temporary name."""
     part = path.with_name(path.name + ".part")
     part.write_text(text, "utf-8")
-    os.replace(part, path)
+    part.replace(path)

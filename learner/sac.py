@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.config import Config
-from common.networks import Encoder, Policy, TwinCritic, flatten, load_state, make_encoder, state_of
+from common.networks import Perception, Policy, TwinCritic, load_state, state_of
 from common.observation import ObservationLayout
 from learner.replay.buffer import Batch
+
+WATCH_INTERVAL = 10
+"""Updates between batches shown to the running normalisation."""
 
 
 class Losses(NamedTuple):
@@ -28,7 +31,7 @@ class Losses(NamedTuple):
 
 
 def td_target(reward: Tensor, discount: Tensor, q_next: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
-    """r + gamma (min_i Q_i(s', a') - alpha log pi(a' | s')), all (B,); q_next (2, B). `discount` is 0 at the end."""
+    """r + discount (min_i Q_i(s', a') - alpha log pi(a' | s')); all (B,) but q_next (2, B)."""
     return reward + discount * (q_next.min(0).values - alpha * log_density)
 
 
@@ -62,22 +65,28 @@ class SAC:
             torch.manual_seed(config.seed + 1)
             self.policy = Policy(layout, config.network)
             self.critic = TwinCritic(layout, config.network)
-        self.encoder: Encoder | None = make_encoder(config) if config.encoder.end_to_end else None
+            self.perception = Perception(config)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.target_encoder = copy.deepcopy(self.encoder).requires_grad_(False) if self.encoder else None
+        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
+        self.target_perception.normalizer = self.perception.normalizer
         self.log_alpha = torch.tensor(math.log(config.sac.initial_alpha), requires_grad=True)
+        self._modules = {
+            "perception": self.perception,
+            "policy": self.policy,
+            "critic": self.critic,
+            "target": self.target,
+            "target_perception": self.target_perception,
+        }
+        self._end_to_end = config.encoder.end_to_end
         rate = config.sac.learning_rate
-        learned = [*self.critic.parameters(), *(self.encoder.parameters() if self.encoder else ())]
+        learned = [*self.critic.parameters(), *self.perception.parameters()]
         self.optimizers = {
             "critic": torch.optim.Adam(learned, rate, fused=True),
             "policy": torch.optim.Adam(self.policy.parameters(), rate, fused=True),
             "temperature": torch.optim.Adam([self.log_alpha], rate),
         }
-        self._online = learned
-        self._targets = [
-            *self.target.parameters(),
-            *(self.target_encoder.parameters() if self.target_encoder else ()),
-        ]
+        self._online: list[Tensor] = [*learned]
+        self._targets: list[Tensor] = [*self.target.parameters(), *self.target_perception.parameters()]
 
     @property
     def alpha(self) -> Tensor:
@@ -85,20 +94,22 @@ class SAC:
         return self.log_alpha.detach().exp()
 
     def update(self, batch: Batch) -> tuple[Losses, NDArray[np.float64]]:
-        """One gradient step on everything that is due; returns figures and |TD error| (B,), the twins' mean."""
+        """One gradient step on all that is due; returns figures and |TD error| (B,), the twins' mean."""
         sac = self.config.sac
         action, reward, discount, weight = (
             torch.from_numpy(part) for part in (batch.action, batch.reward, batch.discount, batch.weight)
         )
+        if self.updates % WATCH_INTERVAL == 0:
+            self.perception.watch(batch.observation)
         with torch.no_grad():
-            following = flatten(batch.next_observation, self.encoder)
+            following = self.perception(batch.next_observation)
             next_action, next_log_density = self.policy.sample(following, self._noise(len(reward)))
-            if self.target_encoder is not None:
-                following = flatten(batch.next_observation, self.target_encoder)
+            if self._end_to_end:
+                following = self.target_perception(batch.next_observation)
             target = td_target(
                 reward, discount, self.target(following, next_action), self.alpha, next_log_density
             )
-        flat = flatten(batch.observation, self.encoder)
+        flat = self.perception(batch.observation)
         q = self.critic(flat, action)
         loss = critic_loss(q, target, weight)
         self._step("critic", loss)
@@ -142,23 +153,18 @@ class SAC:
 
     def policy_state(self) -> dict[str, Tensor]:
         """What an actor needs."""
-        return state_of(policy=self.policy, **({"encoder": self.encoder} if self.encoder else {}))
+        return state_of(perception=self.perception, policy=self.policy)
 
     def critic_state(self) -> dict[str, Tensor]:
-        """What the curriculum needs for Q(s0, a0): the target critics to the letter (alg. 2), else the current."""
+        """What Q(s0, a0) needs: the target critics to the letter (alg. 2), else the current ones."""
         critic = self.target if self.config.curriculum.algorithm == "navacl-q" else self.critic
         return self.policy_state() | state_of(critic=critic)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Networks and optimisers as flat dictionaries of tensors."""
-        encoders = (
-            {"encoder": self.encoder, "target_encoder": self.target_encoder}
-            if self.encoder and self.target_encoder
-            else {}
-        )
-        networks = state_of(policy=self.policy, critic=self.critic, target=self.target, **encoders)
+        networks = state_of(**self._modules)
         networks["log_alpha"] = self.log_alpha.detach()
-        moments = {}
+        moments: dict[str, Tensor] = {}
         for name, optimizer in self.optimizers.items():
             for index, slots in optimizer.state_dict()["state"].items():
                 moments |= {f"{name}.{index}.{key}": value for key, value in slots.items()}
@@ -167,9 +173,7 @@ class SAC:
 
     def load(self, networks: dict[str, Tensor], moments: dict[str, Tensor], updates: int) -> None:
         """Takes what `state` gave; raises ValueError naming the first tensor that does not fit."""
-        load_state(networks, policy=self.policy, critic=self.critic, target=self.target)
-        if self.encoder and self.target_encoder:
-            load_state(networks, encoder=self.encoder, target_encoder=self.target_encoder)
+        load_state(networks, **self._modules)
         with torch.no_grad():
             self.log_alpha.copy_(networks["log_alpha"])
         for name, optimizer in self.optimizers.items():

@@ -233,7 +233,7 @@ class LearnerService:
         self.progress.recent.append(item)
 
     def _update_due(self) -> bool:
-        """Within the ratio of updates to steps, counted from this start on: a resumed run does not catch up."""
+        """Within the ratio of updates to steps, counted from this start: a resumed run does not catch up."""
         if self.replay.transitions < self.config.replay.warmup_steps:
             self._first_update_from = self._log.env_steps
             return False
@@ -270,7 +270,7 @@ class LearnerService:
 
     def _snapshot(self, name: str) -> None:
         networks = self.sac.policy_state()
-        if self.sac.encoder is None:
+        if not self.config.encoder.end_to_end:
             from safetensors.torch import load
 
             networks |= load(self.contract.encoder)
@@ -291,5 +291,5 @@ class LearnerService:
             "elapsed_s": round(time.monotonic() - self._began, 1) if self._began else 0.0,
             "refused": sum(sum(server.refused.values()) for server in self._servers),
         }
-        figures = {name: round(value, 5) for name, value in self.progress.figures().items()}
-        self._reporter.report(values | figures)  # type: ignore[arg-type]
+        values |= {name: round(value, 5) for name, value in self.progress.figures().items()}
+        self._reporter.report(values)

@@ -163,6 +163,13 @@ def test_payload_and_attachment_arrive_to_the_byte(hub, client):
     server.close()
 
 
+def test_a_server_of_a_wildcard_answers_every_key_that_it_covers(hub, client):
+    server = QueryServer(hub, f"{KEYS.trajectory}/**", lambda payload, _: payload)
+    for name in ("local/a", "host-1/b"):
+        assert ask_bytes(client, f"{KEYS.trajectory}/{name}", name.encode()) == name.encode()
+    server.close()
+
+
 def test_one_thread_answers_in_the_order_of_arrival(hub, client):
     seen: list[bytes] = []
     threads: set[int] = set()
@@ -205,11 +212,12 @@ def test_a_failing_handler_answers_internal_error_and_goes_on(hub, client, caplo
 
 
 def test_an_answer_that_cannot_be_sent_does_not_end_the_server(hub, client, caplog):
-    answers = iter([None, b"bytes"])
+    answers = iter([7, b"bytes"])
     server = QueryServer(hub, KEYS.trajectory, lambda *_: next(answers))
-    with pytest.raises((RefusedError, NoAnswerError)):
+    with pytest.raises(RefusedError, match=INTERNAL_ERROR):
         ask_bytes(client, KEYS.trajectory, b"")
     assert ask_bytes(client, KEYS.trajectory, b"") == b"bytes"
+    assert "TypeError" in caplog.text
     server.close()
 
 
@@ -281,7 +289,9 @@ def test_a_full_inbox_refuses_with_busy_at_once_and_keeps_what_it_took(hub, clie
 def test_closing_behind_a_stuck_handler_and_a_full_inbox_returns(hub, client):
     gate = Gate()
     server = QueryServer(hub, KEYS.trajectory, gate, capacity=1)
-    threads = [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"", timeout=30.0)) for _ in range(3)]
+    threads = [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"", timeout=30.0))]
+    assert gate.entered.wait(10)
+    threads += [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"", timeout=30.0)) for _ in range(2)]
     wait_until(lambda: server.refused[BUSY] == 1)
     closing, done = in_thread(server.close)
     closing.join(8)

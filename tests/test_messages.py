@@ -330,9 +330,9 @@ def outside(episode: m.Episode) -> dict:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda e: {"visual": e.visual[:-1]}, r"visual is float16 \(3, 100\), expected float16 \(4, 100\)"),
+        (lambda e: {"visual": e.visual[:-1]}, r"visual is float16 \(3, \d+\), expected float16 \(4, \d+\)"),
         (lambda e: {"visual": e.visual.astype(np.float32)}, "visual is float32"),
-        (lambda e: {"visual": e.visual[..., :-1]}, r"visual is float16 \(4, 99\)"),
+        (lambda e: {"visual": e.visual[..., :-1]}, r"visual is float16 \(4, \d+\)"),
         (lambda e: {"lidar": e.lidar.astype(np.float64)}, "lidar is float64"),
         (lambda e: {"lidar": e.lidar[:, :255]}, r"lidar is float16 \(4, 255\)"),
         (lambda e: {"action": e.action[:, :1]}, r"action is float32 \(4, 1\)"),

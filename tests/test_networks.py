@@ -168,7 +168,7 @@ def test_fast_networks_pass_lidar_and_history_through_and_normalise_the_critics(
     config = resolve("fast")
     layout = ObservationLayout.of(config)
     policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
-    assert linear_sizes(policy.net)[0] == (800 + 256 + 12, 256)
+    assert linear_sizes(policy.net)[0][0] == layout.size == layout.visual + 256 + 12
     assert not any(isinstance(m, nn.LayerNorm) for m in policy.modules())
     assert sum(isinstance(m, nn.LayerNorm) for m in critic.modules()) == 4
 

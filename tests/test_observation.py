@@ -33,12 +33,13 @@ def test_layouts_have_the_documented_sizes():
     assert (paper.row_shape, paper.row_dtype, paper.stack) == ((800,), "float16", 1)
     assert (paper.visual, paper.lidar, paper.history, paper.size) == (800, 256, 12, 1068)
     fast = ObservationLayout.of(resolve("fast"))
-    assert (fast.row_shape, fast.row_dtype, fast.stack) == ((200,), "float16", 4)
-    assert (fast.visual, fast.size) == (800, 1068)
+    code = 25 * resolve("fast").encoder.channels[-1]
+    assert (fast.row_shape, fast.row_dtype, fast.stack) == ((code,), "float16", 4)
+    assert (fast.visual, fast.size) == (4 * code, 4 * code + 256 + 12)
     pixels = ObservationLayout.of(resolve("paper", variant="e2e"))
     assert (pixels.row_shape, pixels.row_dtype, pixels.stack) == ((80, 80, 3), "uint8", 4)
     assert (pixels.visual, pixels.size) == (800, 1068)
-    assert ObservationLayout.of(resolve("fast", variant="e2e")).visual == 800
+    assert ObservationLayout.of(resolve("fast", variant="e2e")).visual == 4 * code
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -18,6 +18,7 @@ from common.tasks import (
     build_scene,
     candidate_task,
     check_cell,
+    dolly_sides,
     geometric_properties,
     random_stream,
     random_task,
@@ -148,6 +149,39 @@ def test_one_to_four_obstacles_stand_left_and_right_of_the_dolly_clear_of_everyt
     assert min(sides.values()) > 0.4 * sum(sides.values())
 
 
+def test_obstacles_keep_their_distance_even_when_they_may_stand_close():
+    settings = ("world.obstacles.distance_min=0.1", "world.obstacles.distance_max=1.6")
+    world, gaps = resolve(overrides=settings).world, []
+    for seed in range(40):
+        scene = build_scene(Task(cell=5, seed=seed, start=StartRanges(distance_max=2.0)), world)
+        for box in scene.obstacles:
+            corners = box.footprint.corners()
+            gaps += [distance_to_rectangle(x, y, body) for x, y in corners for body in footprints(scene)]
+    assert 0.4 <= min(gaps) < 0.5
+
+
+def test_favourable_starts_touch_nothing_and_are_not_docked_yet():
+    ranges = CONFIG.curriculum.gate.ranges
+    for seed in range(200):
+        scene = build_scene(Task(cell=seed % 9, seed=seed, start=ranges), CONFIG.world)
+        robot, _ = footprints(scene)
+        assert not any(rectangles_overlap(robot, side) for side in dolly_sides(scene.dolly, CONFIG.world))
+        distance = math.dist((scene.robot.x, scene.robot.y), (scene.dolly.x, scene.dolly.y))
+        assert ranges.distance_min - 1e-9 <= distance <= ranges.distance_max + 1e-9
+        assert distance > CONFIG.world.reward.success_distance
+
+
+def test_sides_of_the_dolly_hold_the_legs_and_leave_the_tunnel_free():
+    pose = SE2(1.0, 2.0, math.radians(90))
+    sides = dolly_sides(pose, CONFIG.world)
+    for side in sides:
+        assert (side.half_x, side.half_y) == (0.02, 1.230 / 2)
+    # turned by 90 deg, the dolly's left is the cell's -y
+    assert [round(side.pose.y - 2.0, 9) for side in sides] == [-0.39, 0.39]
+    assert not any(rectangles_overlap(Rectangle(pose, 0.369, 0.6), side) for side in sides)
+    assert all(rectangles_overlap(Rectangle(pose, 0.371, 0.6), side) for side in sides)
+
+
 def test_number_of_obstacles_follows_the_configuration():
     world = resolve(overrides=("world.obstacles.count_min=0", "world.obstacles.count_max=0")).world
     assert build_scene(Task(cell=0, seed=1, start=StartRanges()), world).obstacles == ()
@@ -273,20 +307,20 @@ def start_ranges(draw: st.DrawFn) -> StartRanges:
     )
 
 
-@given(start_ranges(), st.floats(0, 1))
-def test_narrowed_ranges_are_valid_and_within_the_original(ranges, scale):
-    small = ranges.narrowed(scale)
-    assert small.distance_min == ranges.distance_min
-    assert small.distance_min <= small.distance_max <= ranges.distance_max
-    assert small.yaw <= ranges.yaw
-    assert small.bearing <= ranges.bearing
-    assert small.dolly_yaw <= ranges.dolly_yaw
+@given(start_ranges(), start_ranges(), st.floats(0, 1))
+def test_ranges_between_two_others_are_valid_and_leave_neither(ranges, others, share):
+    between = ranges.towards(others, share)
+    for key in StartRanges.model_fields:
+        low, high = sorted((getattr(ranges, key), getattr(others, key)))
+        assert low <= getattr(between, key) <= high
+    assert ranges.towards(ranges, share) == ranges
 
 
-def test_narrowing_goes_from_near_and_straight_to_everything():
-    full = StartRanges()
-    assert full.narrowed(1.0) == full
-    near = full.narrowed(0.0)
-    assert (near.distance_min, near.distance_max, near.yaw, near.bearing, near.dolly_yaw) == (1.5, 2, 0, 0, 0)
-    half = full.narrowed(0.5)
-    assert (half.distance_max, half.yaw, half.bearing, half.dolly_yaw) == (3.5, 45, 7.5, 7.5)
+def test_ranges_move_evenly_from_one_end_to_the_other():
+    near = StartRanges(distance_min=1.0, distance_max=2.0, yaw=10, bearing=5, dolly_yaw=3)
+    full = StartRanges(distance_min=1.5, distance_max=5.0, yaw=90, bearing=15, dolly_yaw=15)
+    assert near.towards(full, 0.0) == near
+    assert near.towards(full, 1.0) == full
+    half = near.towards(full, 0.5)
+    assert (half.distance_min, half.distance_max) == (1.25, 3.5)
+    assert (half.yaw, half.bearing, half.dolly_yaw) == (50, 10, 9)

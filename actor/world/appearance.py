@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ class Appearance:
     floor: Color = (0.75, 0.75, 0.72, 1.0)
     wall: Color = (0.85, 0.83, 0.78, 1.0)
     boxes: tuple[Color, ...] = ((0.55, 0.4, 0.25, 1.0),)
-    light: Light = Light()
+    light: Light = field(default_factory=Light)
 
 
 def draw_appearance(rng: np.random.Generator, boxes: int) -> Appearance:

@@ -117,14 +117,17 @@ class Bodies:
 
     def _make_surfaces(self, cell: Cell) -> tuple[int, list[int]]:
         """The floor, drawn only, and the walls, drawn as their inner faces; one texture per m."""
-        l, r, k, f, h = cell.left, cell.right, cell.back, cell.front, cell.wall_height
-        floor = self._quad([[l, k, 0], [r, k, 0], [r, f, 0], [l, f, 0]], r - l, f - k, [0, 0, 1], None)
+        x0, x1, y0, y1, h = cell.left, cell.right, cell.back, cell.front, cell.wall_height
+        width, depth = x1 - x0, y1 - y0
+        floor = self._quad(
+            [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]], width, depth, [0, 0, 1], None
+        )
         left, right, back, front = cell.walls()
         walls = [
-            self._quad([[l, k, 0], [l, f, 0], [l, f, h], [l, k, h]], f - k, h, [1, 0, 0], left),
-            self._quad([[r, f, 0], [r, k, 0], [r, k, h], [r, f, h]], f - k, h, [-1, 0, 0], right),
-            self._quad([[r, k, 0], [l, k, 0], [l, k, h], [r, k, h]], r - l, h, [0, 1, 0], back),
-            self._quad([[l, f, 0], [r, f, 0], [r, f, h], [l, f, h]], r - l, h, [0, -1, 0], front),
+            self._quad([[x0, y0, 0], [x0, y1, 0], [x0, y1, h], [x0, y0, h]], depth, h, [1, 0, 0], left),
+            self._quad([[x1, y1, 0], [x1, y0, 0], [x1, y0, h], [x1, y1, h]], depth, h, [-1, 0, 0], right),
+            self._quad([[x1, y0, 0], [x0, y0, 0], [x0, y0, h], [x1, y0, h]], width, h, [0, 1, 0], back),
+            self._quad([[x0, y1, 0], [x1, y1, 0], [x1, y1, h], [x0, y1, h]], width, h, [0, -1, 0], front),
         ]
         return floor, walls
 

@@ -28,7 +28,7 @@ def _silent_stdout() -> Iterator[None]:
 
 with _silent_stdout():
     import pybullet
-    from pybullet_utils.bullet_client import BulletClient
+    from pybullet_utils.bullet_client import BulletClient as BulletClient
 
 
 def connect() -> BulletClient:

@@ -21,10 +21,12 @@ Observed = dict[str, NDArray[Any]]
 class DockingEnv(gymnasium.Env[Observed, NDArray[np.float32]]):
     """Drive the robot under the dolly.
 
-    Action: (2,) float32 [v, w] in [-1, 1], m/s and rad/s. Observation: `camera` (4, S, S, 3) uint8, oldest
-    first; `lidar` (2 * beams,) float32 in [0, 1]; `actions` (4, 2) and `rewards` (4,) float32, the four most
-    recent, oldest first. `reset(options={"task": Task})` sets the start, `{"cell": 3}` the cell; otherwise the
-    seed decides both.
+    Action: (2,) float32 [v, w] in [-1, 1], m/s and rad/s.
+
+    Observation: `camera` (4, S, S, 3) uint8 and `actions` (4, 2), `rewards` (4,) float32 are the four most
+    recent, oldest first; `lidar` (2 * beams,) float32 in [0, 1].
+
+    `reset(options={"task": Task})` sets the start, `{"cell": 3}` the cell; otherwise the seed decides both.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 6}  # noqa: RUF012
@@ -39,7 +41,7 @@ class DockingEnv(gymnasium.Env[Observed, NDArray[np.float32]]):
         self._rows = Columns.empty(steps + 1, self._layout)
         size = config.world.camera.size
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self.observation_space = spaces.Dict(
+        self.observation_space = spaces.Dict(  # type: ignore[assignment]
             camera=spaces.Box(0, 255, (HISTORY, size, size, 3), np.uint8),
             lidar=spaces.Box(0.0, 1.0, (self._layout.lidar,), np.float32),
             actions=spaces.Box(-1.0, 1.0, (HISTORY, ACTION_SIZE), np.float32),
@@ -67,7 +69,7 @@ class DockingEnv(gymnasium.Env[Observed, NDArray[np.float32]]):
         info = {"ending": ending, "is_success": ending == "success"}
         return self._observe(t + 1), float(reward), ending is not None and not truncated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The scene from above, (480, 480, 3) uint8, in render mode `rgb_array`."""
         return birds_eye(self._world, 480) if self.render_mode == "rgb_array" else None
 

@@ -27,7 +27,7 @@ class Light:
 
 
 class Lidar:
-    """Both scanners, front-left then rear-right, each sweeping counter-clockwise about its outward diagonal."""
+    """Both scanners, front-left then rear-right, sweeping counter-clockwise about the outward diagonal."""
 
     def __init__(self, config: LidarConfig, robot: RobotConfig) -> None:
         self.config = config

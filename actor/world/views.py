@@ -34,7 +34,7 @@ def chase(world: DockingWorld, size: int) -> Picture:
 
 
 def preview(world: DockingWorld) -> Image.Image:
-    """The world from above with the LiDAR's beams, from behind, through its camera, and the task's numbers."""
+    """The world from above with the LiDAR's beams, from behind, through the camera, and the numbers."""
     if world.task is None or world.scene is None:
         raise ValueError("reset the world before drawing it")
     large, small, margin = 640, 320, 12
@@ -50,9 +50,9 @@ def preview(world: DockingWorld) -> Image.Image:
     lines = [
         f"cell {world.task.cell}   seed {world.task.seed}   obstacles {len(world.scene.obstacles)}",
         f"distance {facts.distance:.2f} m   relative angle {math.degrees(facts.relative_angle):.1f} deg   "
-        f"lateral offset {facts.lateral_offset:.2f} m   approach {math.degrees(facts.approach_angle):.1f} deg",
+        f"lateral {facts.lateral_offset:.2f} m   approach {math.degrees(facts.approach_angle):.1f} deg",
         f"clearance of the robot {facts.agent_clearance:.2f} m, of the goal {facts.goal_clearance:.2f} m",
-        "left: from above, with the beams of both LiDARs;  right: from behind, and what the robot's camera sees",
+        "left: from above, with the beams of both LiDARs;  right: from behind, and the camera's view",
     ]
     font = ImageFont.load_default(16)
     for i, line in enumerate(lines):

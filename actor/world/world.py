@@ -99,7 +99,7 @@ class DockingWorld:
             self.bullet.disconnect()
 
     def _contacts(self) -> tuple[bool, bool]:
-        """Whether the robot touches the dolly, and anything else; Bullet also reports points not yet touching."""
+        """Whether the robot touches the dolly, and anything else (Bullet also reports near misses)."""
         touched = {point[2] for point in self.bullet.getContactPoints(self.bodies.robot) if point[8] <= 0.0}
         return self.bodies.dolly in touched, bool(touched - {self.bodies.dolly})
 

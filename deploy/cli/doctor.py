@@ -20,13 +20,11 @@ PACKAGES = ("navaclq", "eclipse-zenoh", "torch", "pybullet", "numpy", "onnxrunti
 
 
 def doctor(
-    connect: Annotated[
-        str | None, typer.Option(help="Endpoint of a hub to ask; exit 1 if it is silent.")
-    ] = None,
+    connect: Annotated[str | None, typer.Option(help="Endpoint of a hub to ask; exit 1 when silent.")] = None,
     insecure: options.Insecure = False,
     as_json: options.Json = False,
 ) -> None:
-    """Check versions, cores, pybullet's numpy support, torch's threads, free disk, and a hub if one is named."""
+    """Check versions, cores, pybullet's numpy support, torch's threads, free disk, and a named hub."""
     address = options.endpoint(connect, insecure) if connect else None
     found = examine()
     found["hub"] = _ask_hub(address) if address else None

@@ -29,7 +29,7 @@ app.add_typer(config.app, name="config")
 
 
 def run() -> None:
-    """Entry point: exit 0 on success, 2 on wrong use with one sentence, 1 when nobody answers or it failed."""
+    """Entry point: exit 0 on success, 2 on wrong use with one sentence, 1 on failure."""
     try:
         code = app(standalone_mode=False)
     except UsageError as error:

@@ -148,8 +148,8 @@ def _compare(run: Path, suite: str, seed: int) -> dict[str, Any]:
 
 def _print_summary(result: dict[str, Any], run: Path) -> None:
     lines = [
-        f"{result['env_steps']} environment steps, {result['episodes']} episodes, {result['updates']} updates "
-        f"in {result['minutes']:g} min (load average {result['load_average']})",
+        f"{result['env_steps']} environment steps, {result['episodes']} episodes, {result['updates']} "
+        f"updates in {result['minutes']:g} min (load average {result['load_average']})",
     ]
     if "eval" in result:
         found = result["eval"]

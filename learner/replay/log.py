@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import struct
 import zlib
 from collections import deque
@@ -48,7 +47,7 @@ class EpisodeLog:
         self._file = None if self._number == 0 else self._path().open("ab")
 
     def restore(self) -> Iterator[Record]:
-        """All records, oldest first; cuts a torn tail and says so. To be exhausted before the first append."""
+        """All records, oldest first; cuts a torn tail and says so. Exhaust it before the first append."""
         saved = self._folder / "seen.json"
         if saved.exists():
             self.seen.restore(json.loads(saved.read_text()))
@@ -93,7 +92,7 @@ class EpisodeLog:
             self._sizes.append((self._path(), self._current))
         part = self._folder / "seen.json.part"  # what the dropped segments knew of duplicates stays known
         part.write_text(json.dumps(self.seen.state()))
-        os.replace(part, self._folder / "seen.json")
+        part.replace(self._folder / "seen.json")
         kept = sum(size for _, size in self._sizes)
         while self._sizes and kept - self._sizes[0][1] >= self._capacity:
             path, size = self._sizes.popleft()
