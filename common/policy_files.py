@@ -27,7 +27,8 @@ def save_folder(folder: Path, texts: dict[str, str], tensors: dict[str, dict[str
     for name, text in texts.items():
         (part / name).write_text(text, "utf-8")
     for name, group in tensors.items():
-        save_file({key: value.detach().contiguous() for key, value in group.items()}, part / name)
+        # safetensors refuses tensors that share memory, as those of a target network may
+        save_file({key: value.detach().clone().contiguous() for key, value in group.items()}, part / name)
     if folder.exists():
         shutil.rmtree(folder)
     part.replace(folder)

@@ -189,7 +189,7 @@ class Curriculum:
 
 
 class CurriculumService:
-    """Serves a Curriculum on the bus. `digest` is the run's contract; None alone, when any sender is welcome."""
+    """Serves a Curriculum on the bus. `digest` is the run's contract; None when it stands alone."""
 
     def __init__(
         self,

@@ -75,8 +75,9 @@ class SAC:
             "policy": self.policy,
             "critic": self.critic,
             "target": self.target,
-            "target_perception": self.target_perception,
         }
+        if config.encoder.end_to_end:
+            self._modules["target_perception"] = self.target_perception
         self._end_to_end = config.encoder.end_to_end
         rate = config.sac.learning_rate
         learned = [*self.critic.parameters(), *self.perception.parameters()]
