@@ -20,7 +20,8 @@ log = logging.getLogger(__name__)
 
 def pack(version: Version, tensors: dict[str, Tensor]) -> WeightsBlob:
     """Tensors as a message."""
-    blob = save_tensors({key: value.detach().contiguous() for key, value in tensors.items()})
+    # safetensors refuses tensors that share memory, as those of a target network may
+    blob = save_tensors({key: value.detach().clone().contiguous() for key, value in tensors.items()})
     return WeightsBlob(version=version, sha256=hashlib.sha256(blob).hexdigest(), blob=blob)
 
 

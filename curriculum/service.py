@@ -47,18 +47,33 @@ SAVE_SECONDS = 5.0
 
 
 class Gate:
-    """Favourable starts until they succeed (section 5.3): open for good once enough of the last ones did."""
+    """Favourable starts until they succeed (section 5.3), in stages that widen."""
 
     def __init__(self, config: Config) -> None:
         self.config = config.curriculum.gate
-        self.open = not self.config.enabled
+        self.stage = 0 if self.config.enabled else self.config.stages
         self.outcomes: deque[bool] = deque(maxlen=self.config.window)
 
-    def add(self, success: bool) -> None:
+    @property
+    def open(self) -> bool:
+        """True for good once the last stage has succeeded."""
+        return self.stage >= self.config.stages
+
+    @property
+    def category(self) -> str:
+        """What tasks of the present stage are called; outcomes of earlier ones do not count."""
+        return f"gate-{self.stage}"
+
+    def add(self, outcome: Outcome) -> None:
         """Takes the outcome of a favourable start."""
-        self.outcomes.append(success)
-        if len(self.outcomes) == self.config.window:
-            self.open = self.open or sum(self.outcomes) >= self.config.threshold * self.config.window
+        if self.open or outcome.category != self.category:
+            return
+        self.outcomes.append(outcome.success)
+        full = len(self.outcomes) == self.config.window
+        if full and sum(self.outcomes) >= self.config.threshold * self.config.window:
+            self.stage += 1
+            self.outcomes.clear()
+            log.info("gate: stage %d of %d", self.stage, self.config.stages)
 
 
 class Curriculum:
@@ -81,15 +96,14 @@ class Curriculum:
             return self._proposal(self._new(random_task(cell, self.config, self.rng)), "random", "rnd")
         if not self.gate.open:
             task = random_task(cell, self.config, self.rng)
-            near = task.model_copy(update={"start": self.gate.config.ranges})
-            return self._proposal(self._new(near), requested, "gate")
+            near = task.model_copy(update={"start": self.gate.config.ranges(self.gate.stage)})
+            return self._proposal(self._new(near), requested, self.gate.category)
         return self._filter(cell, requested)
 
     def report(self, outcome: Outcome) -> None:
         """Takes the outcome of a proposed task."""
         self.outcomes += 1
-        if outcome.category == "gate":
-            self.gate.add(outcome.success)
+        self.gate.add(outcome)
         if self.config.curriculum.algorithm != "rnd":
             self.network.add(outcome.properties, outcome.q, outcome.success)
 
@@ -163,7 +177,7 @@ class Curriculum:
         tensors, numbers = self.network.state()
         state = {
             "numbers": numbers,
-            "gate_open": self.gate.open,
+            "gate_stage": self.gate.stage,
             "gate_outcomes": list(self.gate.outcomes),
             "outcomes": self.outcomes,
             "proposed": self.proposed,
@@ -179,7 +193,7 @@ class Curriculum:
             state = json.loads((folder / "state.json").read_text("utf-8"))
             tensors = load_tensors(folder / "success_network.safetensors")
             self.network.restore(tensors, state["numbers"])
-            self.gate.open = bool(state["gate_open"]) or self.gate.open
+            self.gate.stage = int(state["gate_stage"])
             self.gate.outcomes.extend(state["gate_outcomes"])
             self.outcomes, self.proposed = int(state["outcomes"]), Counter(state["proposed"])
         except (KeyError, ValueError, TypeError) as error:
@@ -280,6 +294,7 @@ class CurriculumService:
             "candidates": len(state.store),
             "outcomes": state.outcomes,
             "gate_open": int(state.gate.open),
+            "gate_stage": state.gate.stage,
             "gate_success": round(sum(state.gate.outcomes) / max(len(state.gate.outcomes), 1), 3),
             "fits": state.network.fits,
             "weights": state.critic.version.counter if state.critic.version else 0,

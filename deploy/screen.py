@@ -45,6 +45,11 @@ class Monitor:
         """The learner's figures; empty before it has spoken."""
         return self.of("learner").get("learner", {})
 
+    @property
+    def curriculum(self) -> dict[str, Value]:
+        """The curriculum's figures; empty before it has spoken."""
+        return self.of("curriculum").get("curriculum", {})
+
 
 class Screen:
     """Shows a Monitor: `update` as often as you like, `say` for events."""
@@ -83,7 +88,7 @@ class Screen:
         v = self._monitor.learner
         if not v:
             return "waiting for the learner"
-        gate = next(iter(self._monitor.of("curriculum").values()), {})
+        gate = self._monitor.curriculum
         alive = sum(self._monitor.alive.values())
         return (
             f"{_clock(v.get('elapsed_s', 0))}  steps {v['env_steps']} ({v['steps_per_s']}/s)  "
@@ -91,7 +96,7 @@ class Screen:
             f"success/100 {_share(v, 'charts/success_100')}  success/500 {_share(v, 'charts/success_500')}  "
             f"endings {_mix(v, 'endings/')}  tasks {_mix(v, 'tasks/')}  replay {v['replay']}  "
             f"staleness {_number(v, 'charts/staleness')}  alpha {_number(v, 'losses/alpha')}  "
-            f"q {_number(v, 'losses/qf_values')}  gate {'open' if gate.get('gate_open') else 'closed'}  "
+            f"q {_number(v, 'losses/qf_values')}  gate {_gate(gate)}  "
             f"processes {alive}"
         )
 
@@ -111,6 +116,7 @@ class Screen:
             ("staleness", f"{_number(v, 'charts/staleness')} updates"),
             ("temperature", _number(v, "losses/alpha")),
             ("Q", _number(v, "losses/qf_values")),
+            ("gate", _gate(self._monitor.curriculum)),
         ]
         for name, value in rows:
             left.add_row(f"[bold]{name}[/]", value)
@@ -121,6 +127,10 @@ class Screen:
             if present and not any(name == known for known, *_ in processes):
                 table.add_row(f"{role} {name}", "[green]alive[/]", "-")
         return Panel(Group(left, "", table, *self._events), title=self._title)
+
+
+def _gate(values: dict[str, Value]) -> str:
+    return "open" if values.get("gate_open") else f"stage {values.get('gate_stage', 0)}"
 
 
 def _clock(seconds: Value) -> str:

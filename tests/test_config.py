@@ -67,6 +67,8 @@ PAPER = {  # facts.md, sections 2 and 3
     "network.history_branch": (8,),
     "network.hidden": (256, 256),
     "network.layer_norm": False,
+    "network.log_lidar": False,
+    "network.normalize": False,
     "sac.gamma": 0.999,
     "sac.learning_rate": 2e-4,
     "sac.batch_size": 64,

@@ -7,21 +7,22 @@ from torch import nn
 from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
-from common.config import resolve
+from common.config import Config, resolve
 from common.networks import (
     LOG_STD_MAX,
     LOG_STD_MIN,
     Encoder,
+    Normalizer,
+    Perception,
     Policy,
     TwinCritic,
     compile_encoder,
-    flatten,
     initial_q,
     load_state,
     make_encoder,
     state_of,
 )
-from common.observation import Columns, ObservationLayout, observe
+from common.observation import Columns, Observation, ObservationLayout, observe
 
 PRESETS = ("paper", "fast", "smoke")
 
@@ -122,29 +123,103 @@ def test_stacks_encoded_end_to_end_equal_the_codes_of_their_frames(frames_per_co
         np.testing.assert_allclose(codes[b], parts, rtol=1e-3, atol=1e-4)
 
 
-def test_encoder_trained_end_to_end_receives_gradients_through_flatten():
-    config = resolve("smoke", variant="e2e")
-    layout, encoder = ObservationLayout.of(config), make_encoder(config)
-    columns = Columns.empty(3, layout)
-    columns.visual[:] = np.random.default_rng(0).integers(0, 256, columns.visual.shape)
-    flat = flatten(observe(columns, np.array([1, 2]), np.array([0, 0]), layout), encoder)
-    assert flat.shape == (2, layout.size)
-    flat.sum().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in encoder.parameters())
+def random_observation(config: Config, batch: int, seed: int = 0) -> Observation:
+    """A batch of observations of random rows."""
+    layout, rng = ObservationLayout.of(config), np.random.default_rng(seed)
+    columns = Columns.empty(batch, layout)
+    high = 256 if layout.row_dtype == "uint8" else 3
+    columns.visual[:] = rng.uniform(0, high, columns.visual.shape)
+    columns.lidar[:] = rng.uniform(0, 1, columns.lidar.shape)
+    columns.action[:] = rng.uniform(-1, 1, columns.action.shape)
+    columns.reward[:] = rng.uniform(-1, 0, columns.reward.shape)
+    return observe(columns, np.arange(batch), np.zeros(batch, np.int64), layout)
 
 
-def test_flat_vector_is_visual_then_lidar_then_history():
-    config = resolve("smoke")
+def test_plain_perception_is_visual_then_lidar_then_history():
+    config = resolve("smoke", overrides=("network.normalize=false", "network.log_lidar=false"))
     layout = ObservationLayout.of(config)
     columns = Columns.empty(4, layout)
     columns.visual[:] = np.arange(4)[:, None]
     columns.lidar[:], columns.action[:], columns.reward[:] = 0.5, 0.25, -1
-    flat = flatten(observe(columns, np.array([3]), np.array([0]), layout))
+    flat = Perception(config)(observe(columns, np.array([3]), np.array([0]), layout))
     assert flat.dtype == torch.float32
     visual, lidar, history = flat[0].split([layout.visual, layout.lidar, layout.history])
     assert visual.reshape(4, -1)[:, 0].tolist() == [0, 1, 2, 3]
     assert (lidar == 0.5).all()
     assert history.tolist() == [0, 0, 0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0, -1, -1, -1]
+
+
+def test_log_lidar_changes_the_lidar_part_only():
+    plain = resolve("smoke", overrides=("network.normalize=false", "network.log_lidar=false"))
+    logged = resolve("smoke", overrides=("network.normalize=false", "network.log_lidar=true"))
+    layout, seen = ObservationLayout.of(plain), random_observation(plain, 3)
+    a, b = Perception(plain)(seen), Perception(logged)(seen)
+    lidar = slice(layout.visual, layout.visual + layout.lidar)
+    torch.testing.assert_close(b[:, lidar], torch.log(a[:, lidar] + 0.01))
+    b[:, lidar] = a[:, lidar]
+    assert torch.equal(a, b)
+
+
+def test_perception_of_the_paper_changes_nothing():
+    config = resolve("paper")
+    seen = random_observation(config, 2)
+    parts = [seen.visual.reshape(2, -1), seen.lidar, seen.history]
+    expected = np.concatenate([part.astype(np.float32) for part in parts], axis=1)
+    np.testing.assert_array_equal(Perception(config)(seen).numpy(), expected)
+
+
+def test_watched_batches_are_what_perception_normalises_by():
+    config = resolve("smoke", overrides=("network.log_lidar=false", "network.normalize=true"))
+    plain = Perception(resolve("smoke", overrides=("network.log_lidar=false", "network.normalize=false")))
+    perception, batches = Perception(config), [random_observation(config, n, n) for n in (30, 7, 60)]
+    for batch in batches:
+        perception.watch(batch)
+    flat = torch.cat([plain(batch) for batch in batches])
+    found = torch.cat([perception(batch) for batch in batches])
+    expected = (flat - flat.mean(0)) / (flat.var(0, correction=0) + 1e-4).sqrt()
+    torch.testing.assert_close(found, expected.clamp(-5, 5), rtol=1e-3, atol=1e-3)
+
+
+def test_running_statistics_equal_those_of_all_batches_together():
+    rng = torch.Generator().manual_seed(0)
+    batches = [torch.randn(n, 3, generator=rng) * torch.tensor([1.0, 5.0, 0.1]) + n for n in (1, 16, 2, 40)]
+    normalizer = Normalizer(3)
+    for batch in batches:
+        normalizer.update(batch)
+    together = torch.cat(batches)
+    torch.testing.assert_close(normalizer.mean, together.mean(0))
+    torch.testing.assert_close(normalizer.variance, together.var(0, correction=0))
+    assert normalizer.count.item() == 59
+
+
+def test_outliers_and_constant_features_stay_bounded():
+    normalizer = Normalizer(2)
+    normalizer.update(torch.tensor([[0.0, 7.0], [1.0, 7.0]]))
+    found = normalizer(torch.tensor([[1e6, 7.0], [-1e6, 7.01]]))
+    assert found[:, 0].tolist() == [5.0, -5.0]
+    assert found[:, 1].tolist() == pytest.approx([0.0, 1.0], abs=1e-3)
+
+
+def test_statistics_travel_with_the_state():
+    config = resolve("smoke")
+    source, target, seen = Perception(config), Perception(config), random_observation(config, 9)
+    source.watch(seen)
+    assert not torch.equal(source(seen), target(seen))
+    load_state(state_of(perception=source), perception=target)
+    assert torch.equal(source(seen), target(seen))
+
+
+def test_perception_end_to_end_passes_gradients_to_its_encoder_and_leaves_its_codes_alone():
+    config = resolve("smoke", variant="e2e")
+    layout, perception, seen = ObservationLayout.of(config), Perception(config), random_observation(config, 3)
+    perception.watch(seen)
+    flat = perception(seen)
+    assert flat.shape == (3, layout.size)
+    assert perception.encoder is not None
+    codes = perception.encoder.encode_stacks(torch.from_numpy(seen.visual))
+    torch.testing.assert_close(flat[:, : layout.visual], codes)
+    flat.sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in perception.encoder.parameters())
 
 
 def test_paper_networks_have_the_papers_branches_and_differ_in_the_output_layer_only():

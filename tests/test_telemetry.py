@@ -18,7 +18,8 @@ exit_on_signals()
 try:
     with open_hub(sys.argv[1]):
         print("up", flush=True)
-        time.sleep(60)
+        while True:  # a signal just before a long sleep would not end it
+            time.sleep(0.05)
 finally:
     print("closed", flush=True)
 """

@@ -33,6 +33,12 @@ def test_transposed_and_trained_tensors_are_packed_by_value():
     assert not found["t"].requires_grad
 
 
+def test_tensors_that_share_memory_are_packed_both():
+    shared = torch.arange(4.0)
+    found = unpack(pack(VERSION, {"a": shared, "b": shared, "c": shared[:2]}))
+    assert [found[key].tolist() for key in "abc"] == [[0, 1, 2, 3], [0, 1, 2, 3], [0, 1]]
+
+
 def test_packed_weights_do_not_change_with_the_network():
     layer = torch.nn.Linear(2, 2)
     before = layer.weight.detach().clone()
