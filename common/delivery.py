@@ -166,24 +166,33 @@ class Sender:
         return len(self.spool)
 
 
+MAX_GAP = 10_000
+"""Numbers by which a message may be ahead of the last one of its incarnation."""
+
+
 class DuplicateFilter:
-    """Remembers what has arrived: per incarnation a high-water mark and the gaps below it."""
+    """Remembers what has arrived: per incarnation a high-water mark and the gaps below it.
+
+    An incarnation that is heard for the first time may begin anywhere, for it may have served another
+    receiver before.
+    """
 
     def __init__(self) -> None:
         self._next: dict[tuple[str, str], int] = {}
         self._gaps: dict[tuple[str, str], set[int]] = defaultdict(set)
 
     def seen(self, origin: Origin) -> bool:
-        """Whether this message has been added before."""
+        """Whether this message was added before; MessageError for a number too far ahead to be honest."""
         key = origin.actor, origin.boot
-        return origin.seq < self._next.get(key, 0) and origin.seq not in self._gaps[key]
+        high = self._next.get(key)
+        if high is not None and origin.seq > high + MAX_GAP:
+            raise MessageError(f"seq {origin.seq} jumps too far ahead of {high}")
+        return origin.seq < (high or 0) and origin.seq not in self._gaps[key]
 
     def add(self, origin: Origin) -> None:
-        """Remembers a message; raises MessageError for a number too far ahead to be honest."""
+        """Remembers a message, for which `seen` was asked before."""
         key = origin.actor, origin.boot
-        high = self._next.get(key, 0)
-        if origin.seq > high + 100_000:
-            raise MessageError(f"seq {origin.seq} jumps too far ahead of {high}")
+        high = self._next.get(key, max(0, origin.seq - MAX_GAP))
         self._gaps[key].discard(origin.seq)
         if origin.seq >= high:
             self._gaps[key].update(range(high, origin.seq))

@@ -158,7 +158,7 @@ class Proposal(Message):
     task: Task
     requested: Requested
     category: Annotated[str, Field(max_length=32)]
-    """What was found: the requested type, `random` when n_T draws met nothing, `gate-STAGE`, `rnd`."""
+    """What was found: the requested type, `random` when n_T draws met nothing, `gate`, `rnd`."""
     properties: GeometricProperties
     q: float | None
     q_reason: str

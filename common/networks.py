@@ -138,7 +138,8 @@ class FusionNetwork(nn.Module):
         self, layout: ObservationLayout, config: NetworkConfig, extra: int, outputs: int, layer_norm: bool
     ) -> None:
         super().__init__()
-        self.sizes = [layout.visual, layout.lidar, layout.history]
+        self._sizes = [layout.visual, layout.lidar, layout.history]
+        self._branched = bool(config.lidar_branch or config.history_branch)
         self.lidar_branch = _mlp((layout.lidar, *config.lidar_branch))
         self.history_branch = _mlp((layout.history, *config.history_branch))
         fused = layout.visual + (layout.lidar, *config.lidar_branch)[-1]
@@ -148,9 +149,10 @@ class FusionNetwork(nn.Module):
 
     def forward(self, flat: Tensor, *extra: Tensor) -> Tensor:
         """(B, layout.size), and (B, extra) if any -> (B, outputs)."""
-        visual, lidar, history = torch.split(flat, self.sizes, dim=-1)
-        parts = (visual, self.lidar_branch(lidar), self.history_branch(history), *extra)
-        out: Tensor = self.output(self.head(torch.cat(parts, dim=-1)))
+        if self._branched:
+            visual, lidar, history = torch.split(flat, self._sizes, dim=-1)
+            flat = torch.cat([visual, self.lidar_branch(lidar), self.history_branch(history)], dim=-1)
+        out: Tensor = self.output(self.head(torch.cat([flat, *extra], dim=-1) if extra else flat))
         return out
 
 
@@ -224,42 +226,38 @@ class Normalizer(nn.Module):
 class Perception(nn.Module):
     """From an observation to the vector [visual, lidar, actions, rewards] that policy and critics take.
 
-    Holds whatever lies between what is stored and that vector: the encoder when it trains end to end, the
-    logarithm of LiDAR distances (a centimetre matters near the dolly's legs and nowhere else) and the running
-    normalisation, which leaves learned codes alone.
+    Holds whatever lies between what is stored and that vector: the encoder when it trains end to end, and the
+    running normalisation, which leaves learned codes alone.
     """
 
     def __init__(self, config: Config) -> None:
         super().__init__()
         layout = ObservationLayout.of(config)
         self.encoder = make_encoder(config) if config.encoder.end_to_end else None
-        self._log_lidar = config.network.log_lidar
-        self._fixed = layout.visual if self.encoder is not None else 0
-        self.normalizer = Normalizer(layout.size - self._fixed) if config.network.normalize else None
+        stored = layout.size if self.encoder is None else layout.size - layout.visual
+        self.normalizer = Normalizer(stored) if config.network.normalize else None
 
-    def _raw(self, observation: Observation) -> Tensor:
-        visual = torch.from_numpy(observation.visual)
-        code = visual.flatten(1).float() if self.encoder is None else self.encoder.encode_stacks(visual)
-        lidar = torch.from_numpy(observation.lidar).float()
-        if self._log_lidar:
-            lidar = torch.log(lidar + 0.01)
-        return torch.cat([code, lidar, torch.from_numpy(observation.history)], dim=1)
+    def _stored(self, observation: Observation) -> Tensor:
+        """The parts that are stored as they are, so that their scale can be known: all but learned codes."""
+        parts = [torch.from_numpy(observation.lidar).float(), torch.from_numpy(observation.history)]
+        if self.encoder is None:
+            parts.insert(0, torch.from_numpy(observation.visual).flatten(1).float())
+        return torch.cat(parts, dim=1)
 
     def forward(self, observation: Observation) -> Tensor:
         """B observations -> (B, layout.size) float32."""
-        raw = self._raw(observation)
-        if self.normalizer is None:
-            return raw
-        if self._fixed == 0:
-            normalized: Tensor = self.normalizer(raw)
-            return normalized
-        return torch.cat([raw[:, : self._fixed], self.normalizer(raw[:, self._fixed :])], dim=1)
+        stored = self._stored(observation)
+        if self.normalizer is not None:
+            stored = self.normalizer(stored)
+        if self.encoder is None:
+            return stored
+        return torch.cat([self.encoder.encode_stacks(torch.from_numpy(observation.visual)), stored], dim=1)
 
     def watch(self, observation: Observation) -> None:
         """Lets the running normalisation see a batch."""
         if self.normalizer is not None:
             with torch.no_grad():
-                self.normalizer.update(self._raw(observation)[:, self._fixed :])
+                self.normalizer.update(self._stored(observation))
 
 
 def initial_q(policy: Policy, critic: TwinCritic, flat: Tensor) -> NDArray[np.float64]:

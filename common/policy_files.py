@@ -29,9 +29,11 @@ def save_folder(folder: Path, texts: dict[str, str], tensors: dict[str, dict[str
     for name, group in tensors.items():
         # safetensors refuses tensors that share memory, as those of a target network may
         save_file({key: value.detach().clone().contiguous() for key, value in group.items()}, part / name)
+    old = folder.with_name(folder.name + ".old.part")
     if folder.exists():
-        shutil.rmtree(folder)
-    part.replace(folder)
+        folder.rename(old)
+    part.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def load_tensors(file: Path) -> dict[str, Tensor]:

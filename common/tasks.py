@@ -215,7 +215,7 @@ def candidate_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
     """A task for the database: `curriculum.narrowed_candidates` of them from ranges narrowed at random."""
     task = random_task(cell, config, rng)
     if rng.random() < config.curriculum.narrowed_candidates:
-        start = config.curriculum.gate.last.towards(config.world.start, float(rng.random()))
+        start = config.curriculum.gate.ranges.towards(config.world.start, float(rng.random()))
         return task.model_copy(update={"start": start})
     return task
 

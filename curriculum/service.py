@@ -47,33 +47,18 @@ SAVE_SECONDS = 5.0
 
 
 class Gate:
-    """Favourable starts until they succeed (section 5.3), in stages that widen."""
+    """Favourable starts until they succeed (section 5.3): open for good once enough of the last ones did."""
 
     def __init__(self, config: Config) -> None:
         self.config = config.curriculum.gate
-        self.stage = 0 if self.config.enabled else self.config.stages
+        self.open = not self.config.enabled
         self.outcomes: deque[bool] = deque(maxlen=self.config.window)
 
-    @property
-    def open(self) -> bool:
-        """True for good once the last stage has succeeded."""
-        return self.stage >= self.config.stages
-
-    @property
-    def category(self) -> str:
-        """What tasks of the present stage are called; outcomes of earlier ones do not count."""
-        return f"gate-{self.stage}"
-
-    def add(self, outcome: Outcome) -> None:
+    def add(self, success: bool) -> None:
         """Takes the outcome of a favourable start."""
-        if self.open or outcome.category != self.category:
-            return
-        self.outcomes.append(outcome.success)
-        full = len(self.outcomes) == self.config.window
-        if full and sum(self.outcomes) >= self.config.threshold * self.config.window:
-            self.stage += 1
-            self.outcomes.clear()
-            log.info("gate: stage %d of %d", self.stage, self.config.stages)
+        self.outcomes.append(success)
+        if len(self.outcomes) == self.config.window:
+            self.open = self.open or sum(self.outcomes) >= self.config.threshold * self.config.window
 
 
 class Curriculum:
@@ -96,14 +81,15 @@ class Curriculum:
             return self._proposal(self._new(random_task(cell, self.config, self.rng)), "random", "rnd")
         if not self.gate.open:
             task = random_task(cell, self.config, self.rng)
-            near = task.model_copy(update={"start": self.gate.config.ranges(self.gate.stage)})
-            return self._proposal(self._new(near), requested, self.gate.category)
+            near = task.model_copy(update={"start": self.gate.config.ranges})
+            return self._proposal(self._new(near), requested, "gate")
         return self._filter(cell, requested)
 
     def report(self, outcome: Outcome) -> None:
         """Takes the outcome of a proposed task."""
         self.outcomes += 1
-        self.gate.add(outcome)
+        if outcome.category == "gate":
+            self.gate.add(outcome.success)
         if self.config.curriculum.algorithm != "rnd":
             self.network.add(outcome.properties, outcome.q, outcome.success)
 
@@ -177,7 +163,7 @@ class Curriculum:
         tensors, numbers = self.network.state()
         state = {
             "numbers": numbers,
-            "gate_stage": self.gate.stage,
+            "gate_open": self.gate.open,
             "gate_outcomes": list(self.gate.outcomes),
             "outcomes": self.outcomes,
             "proposed": self.proposed,
@@ -193,7 +179,7 @@ class Curriculum:
             state = json.loads((folder / "state.json").read_text("utf-8"))
             tensors = load_tensors(folder / "success_network.safetensors")
             self.network.restore(tensors, state["numbers"])
-            self.gate.stage = int(state["gate_stage"])
+            self.gate.open = bool(state["gate_open"])
             self.gate.outcomes.extend(state["gate_outcomes"])
             self.outcomes, self.proposed = int(state["outcomes"]), Counter(state["proposed"])
         except (KeyError, ValueError, TypeError) as error:
@@ -294,7 +280,6 @@ class CurriculumService:
             "candidates": len(state.store),
             "outcomes": state.outcomes,
             "gate_open": int(state.gate.open),
-            "gate_stage": state.gate.stage,
             "gate_success": round(sum(state.gate.outcomes) / max(len(state.gate.outcomes), 1), 3),
             "fits": state.network.fits,
             "weights": state.critic.version.counter if state.critic.version else 0,

@@ -130,7 +130,7 @@ class Screen:
 
 
 def _gate(values: dict[str, Value]) -> str:
-    return "open" if values.get("gate_open") else f"stage {values.get('gate_stage', 0)}"
+    return "open" if values.get("gate_open") else "closed"
 
 
 def _clock(seconds: Value) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -23,6 +24,8 @@ class RunDirectory:
     def __init__(self, folder: Path, config: Config | None = None) -> None:
         """Opens a run, or with `config` starts one; raises UsageError when the folder is something else."""
         self.folder, self.name = folder, folder.resolve().name
+        if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", self.name):
+            raise UsageError(f"run name {self.name!r} may hold letters, digits, _, . and - only, at most 64")
         identity = folder / "run.json"
         if identity.exists():
             self.config = self._open(identity, config)

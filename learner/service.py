@@ -81,7 +81,7 @@ class Progress:
                 finite = table[:, column][~np.isnan(table[:, column])]
                 if len(finite):
                     scalars[name] = float(finite.mean())
-        return {name: value for name, value in scalars.items() if not math.isnan(value)}
+        return {name: value for name, value in scalars.items() if math.isfinite(value)}
 
 
 class LearnerService:

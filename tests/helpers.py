@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from common.config import Config
+from common.config import Config, resolve
 from common.messages import Ending, Episode, Version
 from common.observation import ACTION_SIZE, ObservationLayout
 from common.tasks import Task
@@ -69,3 +69,9 @@ def tiny_episode(
         last_version=version,
         category="random",
     )
+
+
+def small_config(*overrides: str) -> Config:
+    """Preset `smoke` with an observation of 32 numbers: everything is real, a row is a few bytes."""
+    small = ("world.camera.size=16", "world.lidar.beams=2", "network.hidden=[16, 16]")
+    return resolve("smoke", overrides=(*small, *overrides))

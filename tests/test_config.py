@@ -168,14 +168,15 @@ def test_later_overrides_win_and_the_seed_argument_beats_the_file(tmp_path):
     assert resolve(file=file, seed=6, overrides=("seed=7", "seed=8")).seed == 8
 
 
-def test_preset_and_variant_named_in_the_file_apply_unless_given(tmp_path):
+def test_preset_and_variant_named_in_the_file_apply_and_must_not_contradict_the_command(tmp_path):
     file = tmp_path / "own.toml"
     file.write_text('preset = "paper"\nvariant = "rnd"\n')
     config = resolve(file=file)
     assert (config.preset, config.variant) == ("paper", "rnd")
     assert config.sac.gamma == 0.999
     assert config.curriculum.algorithm == "rnd"
-    assert resolve("smoke", file).preset == "smoke"
+    with pytest.raises(UsageError, match="preset = 'paper'.*drop one of them"):
+        resolve("smoke", file)
 
 
 def test_file_of_a_run_resolves_to_the_same_configuration(tmp_path):

@@ -46,6 +46,8 @@ class DockingWorld:
         self.config, self.max_steps = config, max_steps
         self.bullet = connect()
         self.bodies = Bodies(self.bullet, config)
+        self._detect = self.bullet.performCollisionDetection
+        self._points = self.bullet.getContactPoints
         self.lidar = Lidar(config.lidar, config.robot)
         self.camera = Camera(config.camera, config.robot)
         self.drive = DifferentialDrive(config.robot)
@@ -83,7 +85,7 @@ class DockingWorld:
         for _ in range(self.config.substeps):
             self.pose = self.drive.advance(self.pose, targets, dt)
             self.bodies.place(self.bodies.robot, self.pose)
-            self.bullet.performCollisionDetection()
+            self._detect()
             distance = math.hypot(self.pose.x - self.dolly.x, self.pose.y - self.dolly.y)
             ending = ending_of(self.config.reward, distance, *self._contacts())
             if ending:
@@ -100,7 +102,7 @@ class DockingWorld:
 
     def _contacts(self) -> tuple[bool, bool]:
         """Whether the robot touches the dolly, and anything else (Bullet also reports near misses)."""
-        touched = {point[2] for point in self.bullet.getContactPoints(self.bodies.robot) if point[8] <= 0.0}
+        touched = {point[2] for point in self._points(self.bodies.robot) if point[8] <= 0.0}
         return self.bodies.dolly in touched, bool(touched - {self.bodies.dolly})
 
     def _sense(self) -> Sensed:

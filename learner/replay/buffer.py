@@ -85,8 +85,10 @@ class Replay:
         """Stores an episode at the highest current priority."""
         rows = episode.length + 1
         priority = self.highest_priority
-        if self._head + rows > self._size:
-            self._head = 0  # an episode never wraps around the end
+        if self._head + rows > self._size:  # an episode never wraps around the end
+            while self._episodes and self._episodes[0][0] >= self._head:
+                self._drop_oldest()
+            self._head = 0
         first, last = self._head, self._head + rows - 1
         while self._episodes and (
             self._overlaps(first, last) or self.transitions + episode.length > self.config.capacity

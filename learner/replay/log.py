@@ -44,7 +44,7 @@ class EpisodeLog:
         self._current = 0
         folder.mkdir(parents=True, exist_ok=True)
         self._number = max((int(path.stem) for path in folder.glob("*.log")), default=0)
-        self._file = None if self._number == 0 else self._path().open("ab")
+        self._file = None if self._number == 0 else self._path().open("ab", buffering=0)
 
     def restore(self) -> Iterator[Record]:
         """All records, oldest first; cuts a torn tail and says so. Exhaust it before the first append."""
@@ -65,14 +65,22 @@ class EpisodeLog:
                 self._sizes.append((path, transitions))
 
     def append(self, origin: Origin, length: int, payload: bytes) -> Record:
-        """Writes an episode of `length` transitions; it is on record when this returns."""
+        """Writes an episode of `length` transitions; it is on record when this returns.
+
+        Raises OSError when it cannot be written, and leaves no trace of it then.
+        """
         record = Record(origin, self.env_steps + length, self.episodes + 1, length, payload)
         body = msgpack.packb([*origin.model_dump().values(), *record[1:]])
         if self._file is None or self._file.tell() >= self._segment_bytes:
             self._next_segment()
         assert self._file is not None
-        self._file.write(HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body)
-        self._file.flush()
+        data, start = HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body, self._file.tell()
+        try:
+            if self._file.write(data) != len(data):
+                raise OSError(f"{self._path()}: only a part could be written; is the disk full?")
+        except OSError:
+            self._file.truncate(start)
+            raise
         self.seen.add(origin)
         self.env_steps, self.episodes = record.env_steps, record.episodes
         self._current += length
@@ -100,7 +108,7 @@ class EpisodeLog:
             path.unlink()
         self._number += 1
         self._current = 0
-        self._file = self._path().open("ab")
+        self._file = self._path().open("ab", buffering=0)
 
     def _read(self, path: Path) -> Iterator[Record]:
         end = 0
