@@ -185,8 +185,8 @@ class NetworkConfig(Section):
     layer_norm: bool = True
     """LayerNorm in the critics (decided for `fast` by measurement)."""
     normalize: bool = False
-    """Running normalisation of what the networks see. Off: it brings out the noise in the codes of an untrained
-    encoder, and predictions of success on unseen episodes get worse (cross-entropy 0.49 against 0.39)."""
+    """Running normalisation of what the networks see. Off: it brings out the noise in the codes of an
+    untrained encoder; success on unseen episodes is predicted worse (cross-entropy 0.49 against 0.39)."""
 
 
 class SacConfig(Section):

@@ -34,6 +34,11 @@ class ConcatBlock(nn.Module):
         return F.relu(self.down(torch.cat([y, x], dim=1)))
 
 
+LIGHT_CODE_SCALE = 0.1
+"""Brings untrained codes, about 2, to the size of LiDAR readings. Without it they drown the LiDAR: after 4,900
+updates 8% of favourable starts succeeded, with it 35%, as with the LiDAR alone."""
+
+
 class LightBlock(nn.Module):
     """A 3x3 stride-2 convolution and a residual 3x3 convolution."""
 
@@ -66,6 +71,9 @@ class Encoder(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+        if isinstance(blocks[-1], LightBlock):
+            with torch.no_grad():
+                blocks[-1].down.weight *= LIGHT_CODE_SCALE
 
     def forward(self, frames: Tensor) -> Tensor:
         """(B, 3 * frames_per_code, S, S) float32 in [0, 1] -> (B, code) float32."""

@@ -63,8 +63,9 @@ class SuccessNetwork:
     def add(self, properties: GeometricProperties, q: float | None, success: bool) -> bool:
         """Takes an outcome; after every m of them fits, and says so."""
         if q is not None:
+            share = 0.02 if self._q_low <= self._q_high else 1.0  # the first Q is the mean
+            self._q_mean += share * (q - self._q_mean)
             self._q_low, self._q_high = min(self._q_low, q), max(self._q_high, q)
-            self._q_mean += 0.02 * (q - self._q_mean)
         row = np.append(self._row(properties, q), float(success))
         self._fresh.append(row)
         self._reservoir.append(row)
@@ -109,6 +110,8 @@ class SuccessNetwork:
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Tensors and numbers to save."""
         tensors = {f"net.{key}": value for key, value in self.net.state_dict().items()}
+        for index, slots in self._optimizer.state_dict()["state"].items():
+            tensors |= {f"adam.{index}.{key}": value for key, value in slots.items()}
         width = len(self._properties) + 2
         tensors["reservoir"] = torch.from_numpy(np.array(self._reservoir).reshape(-1, width))
         tensors["fresh"] = torch.from_numpy(np.array(self._fresh).reshape(-1, width))
@@ -123,6 +126,12 @@ class SuccessNetwork:
             self.net.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("net.")})
         except RuntimeError as error:
             raise ValueError(str(error).splitlines()[-1].strip()) from None
+        adam = self._optimizer.state_dict()
+        for name, value in tensors.items():
+            if name.startswith("adam."):
+                _, index, key = name.split(".")
+                adam["state"].setdefault(int(index), {})[key] = value.clone()
+        self._optimizer.load_state_dict(adam)
         self._reservoir.extend(tensors["reservoir"].numpy())
         self._fresh = list(tensors["fresh"].numpy())
         self._q_mean, self.fits = numbers["q_mean"], int(numbers["fits"])

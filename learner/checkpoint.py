@@ -96,7 +96,7 @@ class RunDirectory:
             sac.load(
                 load_tensors(newest / NETWORKS), load_tensors(newest / "optimizers.safetensors"), updates
             )
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise UsageError(
                 f"checkpoint {newest} does not fit: {error}; remove it to use an older one"
             ) from None

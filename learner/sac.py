@@ -181,7 +181,7 @@ class SAC:
             state = optimizer.state_dict()
             state["state"] = {
                 index: {
-                    key: moments[f"{name}.{index}.{key}"]
+                    key: moments[f"{name}.{index}.{key}"].clone()  # load_state_dict keeps what it is given
                     for key in ("step", "exp_avg", "exp_avg_sq")
                     if f"{name}.{index}.{key}" in moments
                 }

@@ -112,7 +112,7 @@ class LearnerService:
         self._blobs: dict[str, bytes] = {}
         self._blobs_lock = threading.Lock()
         self._publish()
-        self._snapshot_due = self._log.env_steps
+        self._snapshot_due = self._log.env_steps + config.learner.snapshot_steps
         self._servers = [
             QueryServer(session, self.keys.trajectory, self._take),
             serve(session, self.keys.contract, Nothing, self._answer_contract),

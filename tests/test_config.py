@@ -67,7 +67,6 @@ PAPER = {  # facts.md, sections 2 and 3
     "network.history_branch": (8,),
     "network.hidden": (256, 256),
     "network.layer_norm": False,
-    "network.log_lidar": False,
     "network.normalize": False,
     "sac.gamma": 0.999,
     "sac.learning_rate": 2e-4,
@@ -175,7 +174,7 @@ def test_preset_and_variant_named_in_the_file_apply_and_must_not_contradict_the_
     assert (config.preset, config.variant) == ("paper", "rnd")
     assert config.sac.gamma == 0.999
     assert config.curriculum.algorithm == "rnd"
-    with pytest.raises(UsageError, match="preset = 'paper'.*drop one of them"):
+    with pytest.raises(UsageError, match=r"preset = 'paper'.*drop one of them"):
         resolve("smoke", file)
 
 

@@ -195,7 +195,7 @@ def test_append_that_fails_for_want_of_space_leaves_no_trace(tmp_path):
     size = segment.stat().st_size
     with largest_file(size + 40):
         for _ in range(3):  # the sender tries again
-            with pytest.raises(OSError):  # noqa: PT011 - the reason is the system's
+            with pytest.raises(OSError):
                 log.append(origin(3), 4, bytes(100))
             assert segment.stat().st_size == size
     assert not log.seen.seen(origin(3))
@@ -206,12 +206,26 @@ def test_append_that_fails_for_want_of_space_leaves_no_trace(tmp_path):
     assert [r.origin.seq for r in records] == [0, 1, 2, 3]
 
 
+def test_rotation_that_fails_for_want_of_space_is_made_up_for(tmp_path):
+    log, _ = opened(tmp_path, capacity=5, segment_bytes=1)
+    log.append(origin(0), 4, b"first")
+    with largest_file(4):
+        for _ in range(2):
+            with pytest.raises(OSError):
+                log.append(origin(1), 4, b"second")
+    log.append(origin(1), 4, b"second")
+    log.close()
+    _, records = opened(tmp_path)
+    assert [r.payload for r in records] == [b"first", b"second"]
+    assert list(tmp_path.glob("*.part")) == []
+
+
 def test_failed_append_after_a_torn_tail_leaves_no_hole(tmp_path):
     segment = filled(tmp_path)
     size = segment.stat().st_size
     segment.write_bytes(segment.read_bytes() + b"NVQ1torn" * 20)
     log, _ = opened(tmp_path)
-    with largest_file(size + 10), pytest.raises(OSError):  # noqa: PT011
+    with largest_file(size + 10), pytest.raises(OSError):
         log.append(origin(3), 4, b"late")
     assert segment.stat().st_size == size
     log.append(origin(3), 4, b"late")

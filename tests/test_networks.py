@@ -136,7 +136,7 @@ def random_observation(config: Config, batch: int, seed: int = 0) -> Observation
 
 
 def test_plain_perception_is_visual_then_lidar_then_history():
-    config = resolve("smoke", overrides=("network.normalize=false", "network.log_lidar=false"))
+    config = resolve("smoke", overrides=("network.normalize=false",))
     layout = ObservationLayout.of(config)
     columns = Columns.empty(4, layout)
     columns.visual[:] = np.arange(4)[:, None]
@@ -149,17 +149,6 @@ def test_plain_perception_is_visual_then_lidar_then_history():
     assert history.tolist() == [0, 0, 0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0, -1, -1, -1]
 
 
-def test_log_lidar_changes_the_lidar_part_only():
-    plain = resolve("smoke", overrides=("network.normalize=false", "network.log_lidar=false"))
-    logged = resolve("smoke", overrides=("network.normalize=false", "network.log_lidar=true"))
-    layout, seen = ObservationLayout.of(plain), random_observation(plain, 3)
-    a, b = Perception(plain)(seen), Perception(logged)(seen)
-    lidar = slice(layout.visual, layout.visual + layout.lidar)
-    torch.testing.assert_close(b[:, lidar], torch.log(a[:, lidar] + 0.01))
-    b[:, lidar] = a[:, lidar]
-    assert torch.equal(a, b)
-
-
 def test_perception_of_the_paper_changes_nothing():
     config = resolve("paper")
     seen = random_observation(config, 2)
@@ -169,8 +158,8 @@ def test_perception_of_the_paper_changes_nothing():
 
 
 def test_watched_batches_are_what_perception_normalises_by():
-    config = resolve("smoke", overrides=("network.log_lidar=false", "network.normalize=true"))
-    plain = Perception(resolve("smoke", overrides=("network.log_lidar=false", "network.normalize=false")))
+    config = resolve("smoke", overrides=("network.normalize=true",))
+    plain = Perception(resolve("smoke", overrides=("network.normalize=false",)))
     perception, batches = Perception(config), [random_observation(config, n, n) for n in (30, 7, 60)]
     for batch in batches:
         perception.watch(batch)
@@ -201,7 +190,7 @@ def test_outliers_and_constant_features_stay_bounded():
 
 
 def test_statistics_travel_with_the_state():
-    config = resolve("smoke")
+    config = resolve("smoke", overrides=("network.normalize=true",))
     source, target, seen = Perception(config), Perception(config), random_observation(config, 9)
     source.watch(seen)
     assert not torch.equal(source(seen), target(seen))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import struct
 import zlib
 from collections import deque
@@ -74,7 +75,8 @@ class EpisodeLog:
         if self._file is None or self._file.tell() >= self._segment_bytes:
             self._next_segment()
         assert self._file is not None
-        data, start = HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body, self._file.tell()
+        data = HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body
+        start = self._file.seek(0, os.SEEK_END)  # after a cut the position lies beyond the end
         try:
             if self._file.write(data) != len(data):
                 raise OSError(f"{self._path()}: only a part could be written; is the disk full?")
@@ -95,12 +97,13 @@ class EpisodeLog:
         return self._folder / f"{self._number:08d}.log"
 
     def _next_segment(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._sizes.append((self._path(), self._current))
         part = self._folder / "seen.json.part"  # what the dropped segments knew of duplicates stays known
         part.write_text(json.dumps(self.seen.state()))
         part.replace(self._folder / "seen.json")
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+            self._sizes.append((self._path(), self._current))
         kept = sum(size for _, size in self._sizes)
         while self._sizes and kept - self._sizes[0][1] >= self._capacity:
             path, size = self._sizes.popleft()

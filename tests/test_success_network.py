@@ -1,0 +1,258 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from common.config import resolve
+from common.tasks import GeometricProperties
+from curriculum.success_network import SuccessNetwork
+
+PAPER = resolve("paper").curriculum
+PLUS = resolve("fast").curriculum
+Row = tuple[GeometricProperties, float | None, bool]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def random_properties(rng: np.random.Generator) -> GeometricProperties:
+    return GeometricProperties(
+        distance=rng.uniform(1.5, 5),
+        agent_clearance=rng.uniform(1, 5),
+        goal_clearance=rng.uniform(1, 5),
+        relative_angle=rng.uniform(0, math.pi / 2),
+        lateral_offset=rng.uniform(0, 1.5),
+        approach_angle=rng.uniform(0, math.pi / 6),
+    )
+
+
+def random_rows(count: int, seed: int = 0, missing: bool = False) -> list[Row]:
+    """Outcomes of which every third has no Q when some are to be `missing`."""
+    rng = np.random.default_rng(seed)
+    return [
+        (
+            random_properties(rng),
+            None if missing and i % 3 == 0 else float(rng.uniform(-5, 8)),
+            bool(rng.random() < 0.5),
+        )
+        for i in range(count)
+    ]
+
+
+def inputs(rows: list[Row], q: list[float]) -> torch.Tensor:
+    """The inputs of the paper's f_pi in about [-1, 1]; `q` already scaled."""
+    return torch.tensor(
+        [
+            [
+                (p.distance - 3.25) / 1.75,
+                (p.agent_clearance - 3) / 2,
+                (p.goal_clearance - 3) / 2,
+                (p.relative_angle - math.pi / 4) / (math.pi / 4),
+                value,
+            ]
+            for (p, _, _), value in zip(rows, q, strict=True)
+        ]
+    )
+
+
+def labels(rows: list[Row]) -> torch.Tensor:
+    return torch.tensor([float(success) for _, _, success in rows])
+
+
+def twin_of(network: SuccessNetwork) -> tuple[nn.Sequential, torch.optim.Adam]:
+    """The paper's f_pi and optimiser (appendix B), built here, from the same start."""
+    net = nn.Sequential(nn.Linear(5, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
+    net.load_state_dict(network.net.state_dict())
+    return net, torch.optim.Adam(net.parameters(), lr=4e-4)
+
+
+def step(net: nn.Sequential, optimizer: torch.optim.Adam, x: torch.Tensor, y: torch.Tensor) -> float:
+    loss = F.binary_cross_entropy(torch.sigmoid(net(x)).squeeze(-1), y)
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss.item()
+
+
+def assert_same_weights(network: SuccessNetwork, net: nn.Sequential) -> None:
+    for ours, theirs in zip(network.net.parameters(), net.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("config", "size"), [(PAPER, 5), (PLUS, 7)])
+def test_network_has_two_hidden_layers_of_32_with_relu(config, size):
+    net = SuccessNetwork(config, 0).net
+    shapes = [(m.in_features, m.out_features) if isinstance(m, nn.Linear) else type(m) for m in net]
+    assert shapes == [(size, 32), nn.ReLU, (32, 32), nn.ReLU, (32, 1)]
+
+
+def test_paper_takes_one_adam_step_per_16_outcomes_on_exactly_the_fresh_ones():
+    network = SuccessNetwork(PAPER, 0)
+    net, optimizer = twin_of(network)
+    low, high = math.inf, -math.inf
+    for seed in range(3):
+        rows = random_rows(16, seed)
+        fitted = [network.add(*row) for row in rows]
+        assert fitted == [False] * 15 + [True]
+        assert network.fits == seed + 1
+        q = [value for _, value, _ in rows]
+        low, high = min(low, *q), max(high, *q)
+        middle, half = (low + high) / 2, (high - low) / 2
+        loss = step(net, optimizer, inputs(rows, [(v - middle) / half for v in q]), labels(rows))
+        assert network.loss == pytest.approx(loss, rel=1e-4)
+        assert_same_weights(network, net)
+
+
+def test_prediction_is_the_sigmoid_of_the_network_with_q_at_the_ends_of_its_range():
+    network = SuccessNetwork(PAPER, 0)
+    rows = random_rows(16)
+    for p, _, success in rows:
+        network.add(p, 2.0 if success else -4.0, success)
+    with torch.no_grad():
+        for value, scaled in ((-4.0, -1.0), (2.0, 1.0), (-1.0, 0.0), (100.0, 1.5), (-100.0, -1.5)):
+            expected = torch.sigmoid(network.net(inputs(rows, [scaled] * 16))).squeeze(-1).numpy()
+            f = network.predict([p for p, _, _ in rows], [value] * 16)
+            assert f.shape == (16,)
+            np.testing.assert_allclose(f, expected, rtol=1e-5)
+
+
+def test_missing_q_is_predicted_at_the_running_mean_of_q():
+    network = SuccessNetwork(PAPER, 0)
+    rows = random_rows(10)
+    mean = rows[0][1]
+    for p, q, success in rows:
+        network.add(p, q, success)
+        mean += 0.02 * (q - mean)
+    properties = [p for p, _, _ in rows]
+    np.testing.assert_allclose(
+        network.predict(properties, [None] * 10), network.predict(properties, [mean] * 10)
+    )
+    assert not np.allclose(
+        network.predict(properties, [None] * 10), network.predict(properties, [mean + 3] * 10)
+    )
+
+
+def test_running_mean_of_q_lies_within_the_range_of_q_from_the_first_on():
+    network = SuccessNetwork(PAPER, 0)
+    for q in (-5.0, -4.0):
+        network.add(random_rows(1)[0][0], q, False)
+    p = [random_rows(1)[0][0]]
+    scaled = 2 * 0.02 - 1  # the mean is -5 + 0.02
+    with torch.no_grad():
+        expected = torch.sigmoid(network.net(inputs(random_rows(1), [scaled]))).item()
+    assert network.predict(p, [None])[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_fit_leaves_out_the_outcomes_without_q_when_some_have_one():
+    network = SuccessNetwork(PAPER, 0)
+    net, optimizer = twin_of(network)
+    rows = random_rows(16, missing=True)
+    for row in rows:
+        network.add(*row)
+    real = [row for row in rows if row[1] is not None]
+    q = np.array([row[1] for row in real])
+    middle, half = (q.min() + q.max()) / 2, (q.max() - q.min()) / 2
+    step(net, optimizer, inputs(real, ((q - middle) / half).tolist()), labels(real))
+    assert len(real) == 10
+    assert_same_weights(network, net)
+
+
+def test_fit_without_any_q_takes_all_at_the_mean():
+    network = SuccessNetwork(PAPER, 0)
+    net, optimizer = twin_of(network)
+    rows = [(p, None, success) for p, _, success in random_rows(16)]
+    for row in rows:
+        network.add(*row)
+    step(net, optimizer, inputs(rows, [0.0] * 16), labels(rows))
+    assert_same_weights(network, net)
+
+
+def test_plus_fits_several_steps_from_all_that_its_reservoir_holds():
+    config = PLUS.model_copy(update={"fit_steps": 3, "reservoir": 20})
+    network = SuccessNetwork(config, 0)
+    for row in random_rows(48):
+        network.add(*row)
+    assert network.fits == 3
+    steps = [slots["step"].item() for slots in network._optimizer.state_dict()["state"].values()]
+    assert set(steps) == {9.0}
+    assert network.state()[0]["reservoir"].shape == (20, 8), "the oldest outcomes went"
+
+
+def test_plus_learns_a_separable_problem():
+    rng, network = np.random.default_rng(0), SuccessNetwork(PLUS, 0)
+    for _ in range(480):
+        p = random_properties(rng)
+        network.add(p, float(rng.normal()), p.lateral_offset < 0.75)
+    unseen = [random_properties(rng) for _ in range(500)]
+    f = network.predict(unseen, [0.0] * 500)
+    truth = np.array([p.lateral_offset < 0.75 for p in unseen])
+    assert ((f > 0.5) == truth).mean() > 0.95
+    assert f[truth].mean() > 0.85
+    assert f[~truth].mean() < 0.15
+    assert network.loss < 0.2
+
+
+def test_both_learn_that_a_high_q_means_success():
+    for config, count in ((PLUS, 480), (PAPER.model_copy(update={"learning_rate": 4e-3}), 4800)):
+        rng, network = np.random.default_rng(0), SuccessNetwork(config, 0)
+        for _ in range(count):
+            q = float(rng.uniform(-10, 10))
+            network.add(random_properties(rng), q, q > 0)
+        p = [random_properties(rng) for _ in range(50)]
+        assert network.predict(p, [8.0] * 50).min() > 0.8
+        assert network.predict(p, [-8.0] * 50).max() < 0.2
+
+
+def test_network_starts_from_its_seed_and_leaves_the_global_generator_alone():
+    torch.manual_seed(3)
+    before = torch.random.get_rng_state()
+    a, b, c = (SuccessNetwork(PAPER, seed).net[0].weight for seed in (1, 1, 2))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert torch.equal(a, b)
+    assert not torch.equal(a, c)
+
+
+@pytest.mark.parametrize("config", [PAPER, PLUS])
+def test_restored_network_predicts_to_the_bit_what_the_saved_one_did(config):
+    saved, restored = SuccessNetwork(config, 0), SuccessNetwork(config, 9)
+    for row in random_rows(40, missing=True):
+        saved.add(*row)
+    restored.restore(*saved.state())
+    rows = random_rows(30, seed=1)
+    for q in ([value for _, value, _ in rows], [None] * 30):
+        properties = [p for p, _, _ in rows]
+        assert restored.predict(properties, q).tolist() == saved.predict(properties, q).tolist()
+    assert restored.fits == saved.fits == 2
+
+
+def test_restored_network_learns_on_to_the_bit_as_the_saved_one():
+    saved, restored = SuccessNetwork(PAPER, 0), SuccessNetwork(PAPER, 9)
+    for row in random_rows(40):  # two fits, and eight fresh outcomes on the way to the third
+        saved.add(*row)
+    restored.restore(*saved.state())
+    rows = random_rows(24, seed=2)
+    assert [saved.add(*row) for row in rows] == [restored.add(*row) for row in rows]
+    assert saved.fits == 4
+    assert saved.loss == restored.loss
+    for ours, theirs in zip(saved.net.parameters(), restored.net.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_state_before_the_first_outcome_can_be_restored():
+    restored = SuccessNetwork(PAPER, 9)
+    restored.restore(*SuccessNetwork(PAPER, 0).state())
+    assert restored.fits == 0
+    assert [restored.add(*row) for row in random_rows(16)][-1]
+
+
+def test_state_of_the_other_algorithm_is_refused():
+    with pytest.raises(ValueError, match=r"size mismatch for 0\.weight"):
+        SuccessNetwork(PAPER, 0).restore(*SuccessNetwork(PLUS, 0).state())
