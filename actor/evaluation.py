@@ -36,7 +36,7 @@ class Examiner:
         try:
             if not config.encoder.end_to_end:
                 load_state(tensors, encoder=encoder)
-            self._actor.load(Version(), tensors)
+            self._actor.load(Version(counter=1), tensors)
         except ValueError as error:
             raise UsageError(f"{policy} holds other networks than its configuration says: {error}") from None
         self._rollout = Rollout(config, Eyes(config, encoder), slots, config.world.max_evaluation_steps)

@@ -18,6 +18,7 @@ from common.bus import Keys, announce, ask_later
 from common.config import Config
 from common.contract import contract_encoder
 from common.delivery import Sender, Spool
+from common.errors import UsageError
 from common.messages import (
     Candidate,
     Candidates,
@@ -131,7 +132,12 @@ class ActorService:
     def _refresh_weights(self) -> None:
         newest = self._weights.newest
         if newest is not None and self._actor.newest.version < newest[0]:
-            self._actor.load(*newest)
+            try:
+                self._actor.load(*newest)
+            except ValueError as error:
+                raise UsageError(
+                    f"the learner has other networks than are configured here: {error}"
+                ) from None
             if self.config.actor.refresh == "step":
                 for slot in range(len(self._rollout)):
                     self._actor.refresh(slot)

@@ -227,9 +227,30 @@ def ask_bytes(
     raise NoAnswerError(f"nobody serves {key}")
 
 
-def ask(session: zenoh.Session, key: str, question: Message, kind: type[M], timeout: float = 10.0) -> M:
-    """Asks and waits for a reply of type `kind`; raises NoAnswerError, RefusedError or MessageError."""
-    return decode(kind, ask_bytes(session, key, encode(question), timeout=timeout))
+def ask(
+    session: zenoh.Session,
+    key: str,
+    question: Message,
+    kind: type[M],
+    timeout: float = 10.0,
+    patience: float = 0.0,
+    on_wait: Callable[[float], None] | None = None,
+) -> M:
+    """Asks and waits for a reply of type `kind`; raises NoAnswerError, RefusedError or MessageError.
+
+    While nobody answers it asks again, for `patience` s, and tells `on_wait` the seconds so far.
+    """
+    began = time.monotonic()
+    while True:
+        try:
+            return decode(kind, ask_bytes(session, key, encode(question), timeout=timeout))
+        except NoAnswerError:
+            waited = time.monotonic() - began
+            if waited > patience:
+                raise
+            if on_wait:
+                on_wait(waited)
+            time.sleep(0.2)
 
 
 def ask_later(

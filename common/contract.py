@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
+import math
 from collections.abc import Callable
 from functools import reduce
 from operator import getitem
@@ -17,7 +17,7 @@ import zenoh
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from common.bus import Keys, NoAnswerError, ask
+from common.bus import Keys, ask
 from common.config import Config, differing_key, override, parse
 from common.errors import UsageError
 from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
@@ -93,12 +93,8 @@ def accept_contract(contract: ContractReply, overrides: tuple[str, ...] = ()) ->
     return ours
 
 
-def fetch_contract(session: zenoh.Session, on_wait: Callable[[], None] | None = None) -> ContractReply:
+def fetch_contract(
+    session: zenoh.Session, on_wait: Callable[[float], None] | None = None, patience: float = math.inf
+) -> ContractReply:
     """Asks whoever serves this endpoint for the run's contract, until somebody answers."""
-    while True:
-        try:
-            return ask(session, Keys("*").contract, Nothing(), ContractReply, timeout=5.0)
-        except NoAnswerError:
-            if on_wait:
-                on_wait()
-            time.sleep(0.3)
+    return ask(session, Keys("*").contract, Nothing(), ContractReply, 5.0, patience, on_wait)

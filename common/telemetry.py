@@ -40,15 +40,15 @@ class Rate:
     """Events per second, over the time between two readings."""
 
     def __init__(self) -> None:
-        self._count, self._time, self._value = 0.0, time.monotonic(), 0.0
+        self._count, self._time, self.value = 0.0, time.monotonic(), 0.0
 
     def read(self, count: float) -> float:
         """The rate at which `count` has grown, renewed at most once a second."""
         now = time.monotonic()
         if now - self._time >= 1.0:
-            self._value = (count - self._count) / (now - self._time)
+            self.value = (count - self._count) / (now - self._time)
             self._count, self._time = count, now
-        return self._value
+        return self.value
 
 
 def start_logging(level: int = logging.INFO) -> None:

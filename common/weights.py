@@ -6,6 +6,7 @@ import hashlib
 import logging
 import queue
 import threading
+import time
 
 import zenoh
 from safetensors.torch import load as load_tensors
@@ -38,9 +39,10 @@ def unpack(message: WeightsBlob) -> dict[str, Tensor]:
 class WeightsPuller:
     """Keeps the newest weights of a kind at hand: hears of versions, pulls them from a thread of its own."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys, kind: str) -> None:
+    def __init__(self, session: zenoh.Session, keys: Keys, kind: str, rest: float = 0.0) -> None:
+        """`rest` is the least time between two pulls, s."""
         self.newest: tuple[Version, dict[str, Tensor]] | None = None
-        self._session, self._key = session, keys.weights(kind)
+        self._session, self._key, self._rest = session, keys.weights(kind), rest
         self._heard: queue.SimpleQueue[Version] = queue.SimpleQueue()
         self._subscription = subscribe(session, keys.version, Version, self._heard.put)
         threading.Thread(target=self._run, name="weights", daemon=True).start()
@@ -53,6 +55,7 @@ class WeightsPuller:
                 version = self._heard.get()
             if self.newest is None or self.newest[0] < version:
                 self._pull()
+            time.sleep(self._rest)
 
     def _pull(self) -> None:
         try:

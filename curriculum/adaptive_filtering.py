@@ -65,14 +65,18 @@ def get_dynamic_task(
 
 
 def get_anchored_task(
-    requested: Requested, f: Predictions, config: CurriculumConfig, rng: np.random.Generator
+    requested: Requested,
+    f: Predictions,
+    mu: float,
+    sigma: float,
+    config: CurriculumConfig,
+    rng: np.random.Generator,
 ) -> int | None:
     """NavACL-Q+: as algorithm 1, but the frontier lies at predicted success 0.5, wherever mu is.
 
     One of the ten tasks of highest p (1 - p): even when all are too hard or too easy, the least so.
     """
     if requested != "frontier":
-        mu, sigma = fit_normal(f)
         return get_dynamic_task(requested, f.tolist(), mu, sigma, config)
     uncertain = np.argsort(-f * (1 - f), kind="stable")[:FRONTIER_POOL]
     return int(rng.choice(uncertain))

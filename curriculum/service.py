@@ -44,6 +44,8 @@ from curriculum.task_store import CriticView, Entry, TaskStore
 
 log = logging.getLogger(__name__)
 SAVE_SECONDS = 5.0
+CRITIC_REST_SECONDS = 6.0
+"""Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
 
 
 class Gate:
@@ -73,6 +75,7 @@ class Curriculum:
         self.gate = Gate(config)
         self.proposed: Counter[str] = Counter()
         self.outcomes = 0
+        self.seen = DuplicateFilter()
 
     def propose(self, cell: int, t: int) -> Proposal:
         """A task for a cell, asked at the agent's own step t (algorithm 2)."""
@@ -98,10 +101,11 @@ class Curriculum:
         config = self.config.curriculum
         sample = self._draw(cell, config.filter_samples)
         mu, sigma = fit_normal(self._predict(sample))
-        draws = self._draw(cell, config.max_draws)
+        # an empty database is made up for by geometry, too slow to do twice
+        draws = self._draw(cell, config.max_draws) if self.store.count(cell) else sample
         f = self._predict(draws)
         if self.network.plus:
-            found = get_anchored_task(requested, f, config, self.rng)
+            found = get_anchored_task(requested, f, mu, sigma, config, self.rng)
         else:
             found = get_dynamic_task(requested, f.tolist(), mu, sigma, config)
         category: str = requested if found is not None else "random"
@@ -166,6 +170,7 @@ class Curriculum:
             "gate_open": self.gate.open,
             "gate_outcomes": list(self.gate.outcomes),
             "outcomes": self.outcomes,
+            "seen": self.seen.state(),
             "proposed": self.proposed,
         }
         texts = {"state.json": json.dumps(state), "config.toml": self.config.to_toml()}
@@ -181,6 +186,7 @@ class Curriculum:
             self.network.restore(tensors, state["numbers"])
             self.gate.open = bool(state["gate_open"])
             self.gate.outcomes.extend(state["gate_outcomes"])
+            self.seen.restore(state.get("seen", []))
             self.outcomes, self.proposed = int(state["outcomes"]), Counter(state["proposed"])
         except (KeyError, ValueError, TypeError) as error:
             raise UsageError(
@@ -206,10 +212,11 @@ class CurriculumService:
             self.curriculum.restore(folder)
         self._digest = digest
         self._lock = threading.Lock()
-        self._seen = DuplicateFilter()
         keys = Keys(run)
         self._token = announce(session, keys, "curriculum", "curriculum")
-        self._weights = WeightsPuller(session, keys, "critic") if digest is not None else None
+        self._weights = (
+            WeightsPuller(session, keys, "critic", CRITIC_REST_SECONDS) if digest is not None else None
+        )
         self._servers = [
             serve(session, keys.task, TaskQuery, self._propose),
             QueryServer(session, keys.result, self._take_outcome),
@@ -224,8 +231,13 @@ class CurriculumService:
             time.sleep(0.2)
             newest = self._weights.newest if self._weights else None
             if newest is not None and self.curriculum.critic.version != newest[0]:
-                with self._lock:
-                    self.curriculum.critic.load(*newest)
+                try:
+                    with self._lock:
+                        self.curriculum.critic.load(*newest)
+                except ValueError as error:
+                    raise UsageError(
+                        f"the learner has other networks than are configured here: {error}"
+                    ) from None
             if self._reporter.due:
                 self._report()
             if time.monotonic() - saved >= SAVE_SECONDS:
@@ -268,10 +280,10 @@ class CurriculumService:
         if self._digest is not None:
             check_digest(self._digest, message.digest)  # type: ignore[attr-defined]
         with self._lock:
-            duplicate = self._seen.seen(origin)
+            duplicate = self.curriculum.seen.seen(origin)
             if not duplicate:
                 add(message)
-                self._seen.add(origin)
+                self.curriculum.seen.add(origin)
         return encode(Acknowledgement(duplicate=duplicate))
 
     def _report(self) -> None:

@@ -41,15 +41,17 @@ class RunDirectory:
 
     def _open(self, identity: Path, wanted: Config | None) -> Config:
         try:
-            schema = json.loads(identity.read_text("utf-8"))["schema"]
-        except (ValueError, KeyError, TypeError):
-            raise UsageError(f"{identity} is damaged") from None
+            values = json.loads(identity.read_text("utf-8"))
+            schema, _ = values["schema"], int(values["epoch"])
+            text = (self.folder / CONFIG).read_text("utf-8")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(f"run directory {self.folder} is damaged: {error!r}") from None
         if schema != RUN_SCHEMA:
             raise UsageError(
                 f"{self.folder} was made by an incompatible version: "
                 f"its run schema is {schema}, this version has {RUN_SCHEMA}"
             )
-        config = parse((self.folder / CONFIG).read_text("utf-8"))
+        config = parse(text)
         if wanted is not None and (found := differing_key(wanted, config)):
             key, asked, has = found
             raise UsageError(

@@ -149,7 +149,8 @@ class LearnerService:
                 self._report(rates[0].read(self._log.env_steps), rates[1].read(self.sac.updates))
             if now - last_board >= 5.0:
                 last_board = now
-                for name, value in self.progress.figures().items():
+                speed = {"charts/SPS": rates[0].value, "charts/UPS": rates[1].value}
+                for name, value in (self.progress.figures() | speed).items():
                     self._board.add_scalar(name, value, self._log.env_steps)
         log.info("the time is over after %d updates", self.sac.updates)
 

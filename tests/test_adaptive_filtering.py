@@ -149,7 +149,7 @@ def test_anchored_frontier_picks_evenly_among_the_ten_nearest_to_one_half():
     f = rng.permutation(
         np.concatenate([np.linspace(0.0, 0.4, 20), np.linspace(0.45, 0.55, 10), [0.97, 0.99]])
     )
-    picked = Counter(get_anchored_task("frontier", f, PLUS, rng) for _ in range(5000))
+    picked = Counter(get_anchored_task("frontier", f, *fit_normal(f), PLUS, rng) for _ in range(5000))
     assert {f[i] for i in picked} == set(np.linspace(0.45, 0.55, 10))
     chi_square = sum((count - 500) ** 2 / 500 for count in picked.values())
     assert chi_square < 21.67  # 9 degrees of freedom, 1%
@@ -159,13 +159,15 @@ def test_anchored_frontier_picks_evenly_among_the_ten_nearest_to_one_half():
 def test_anchored_frontier_is_the_least_hopeless_or_least_sure_when_none_is_near_one_half(reach):
     rng = np.random.default_rng(2)
     f = np.linspace(*reach, 100)
-    picked = {get_anchored_task("frontier", f, PLUS, rng) for _ in range(500)}
+    picked = {get_anchored_task("frontier", f, *fit_normal(f), PLUS, rng) for _ in range(500)}
     assert picked == set(range(90, 100) if reach[0] == 0 else range(10))
 
 
 def test_anchored_frontier_serves_a_database_of_fewer_than_ten():
     rng = np.random.default_rng(3)
-    assert {get_anchored_task("frontier", np.array([0.1, 0.2, 0.3]), PLUS, rng) for _ in range(100)} == {
+    assert {
+        get_anchored_task("frontier", np.array([0.1, 0.2, 0.3]), 0.2, 0.1, PLUS, rng) for _ in range(100)
+    } == {
         0,
         1,
         2,
@@ -177,6 +179,6 @@ def test_anchored_easy_and_random_are_those_of_algorithm_1():
     f = np.array([0.1, 0.2, 0.9, 0.95, 0.15])
     mu, sigma = fit_normal(f)
     assert mu + sigma < 0.9
-    assert get_anchored_task("easy", f, PLUS, rng) == 2
-    assert get_anchored_task("random", f, PLUS, rng) == 0
-    assert get_anchored_task("easy", np.full(5, 0.3), PLUS, rng) is None
+    assert get_anchored_task("easy", f, *fit_normal(f), PLUS, rng) == 2
+    assert get_anchored_task("random", f, *fit_normal(f), PLUS, rng) == 0
+    assert get_anchored_task("easy", np.full(5, 0.3), 0.3, 0.0, PLUS, rng) is None

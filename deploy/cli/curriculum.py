@@ -18,6 +18,7 @@ from common.messages import Proposals, TaskQuery
 from common.tasks import check_cell
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
+from deploy.cli.processes import say_waiting
 
 if TYPE_CHECKING:
     from curriculum.service import CurriculumService
@@ -54,8 +55,10 @@ def serve_curriculum(
     start_logging()
     exit_on_signals()
     if connect:
-        with open_client(options.endpoint(connect, insecure), lambda s: None) as session:
-            contract = fetch_contract(session)
+        with open_client(
+            options.endpoint(connect, insecure), say_waiting(f"the hub at {connect}")
+        ) as session:
+            contract = fetch_contract(session, say_waiting("a learner at the hub"))
             resolved = accept_contract(contract, tuple(settings or ()))
             _serve(CurriculumService(session, contract.run, resolved, contract.digest, folder), connect)
     else:
@@ -89,7 +92,8 @@ def query(
     """Ask a running curriculum for tasks."""
     check_cell(cell)
     with open_client(options.endpoint(connect, insecure), patience=timeout) as session:
-        answer = ask(session, Keys("*").task, TaskQuery(cell=cell, t=t, count=count), Proposals, timeout)
+        question = TaskQuery(cell=cell, t=t, count=count)
+        answer = ask(session, Keys("*").task, question, Proposals, timeout, patience=timeout)
     if as_json:
         tasks = [{**p.task.model_dump(), **p.model_dump(exclude={"task"})} for p in answer.tasks]
         options.print_json({"tasks": tasks})

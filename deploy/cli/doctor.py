@@ -12,8 +12,9 @@ from typing import Annotated, Any
 
 import typer
 
-from common.bus import Keys, NoAnswerError, RefusedError, ask, open_client
-from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
+from common.bus import NoAnswerError, RefusedError, open_client
+from common.contract import fetch_contract
+from common.messages import SCHEMA_VERSION, MessageError
 from deploy.cli import options
 
 PACKAGES = ("navaclq", "eclipse-zenoh", "torch", "pybullet", "numpy", "onnxruntime", "gymnasium", "pydantic")
@@ -62,8 +63,7 @@ def _ask_hub(address: str) -> dict[str, Any]:
     try:
         with open_client(address, patience=3.0) as session:
             answer["answers"] = True
-            contract = ask(session, Keys("*").contract, Nothing(), ContractReply, timeout=3.0)
-            answer["run"] = contract.run
+            answer["run"] = fetch_contract(session, patience=1.0).run
     except (NoAnswerError, RefusedError, MessageError) as error:
         answer["reason"] = str(error)
     return answer

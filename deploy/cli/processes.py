@@ -78,8 +78,8 @@ def actor(
 
     start_logging()
     exit_on_signals()
-    with open_client(address, _say_waiting(address)) as session:
-        contract = fetch_contract(session, lambda: log.info("the hub answers, but no learner yet; waiting"))
+    with open_client(address, say_waiting(f"the hub at {address}")) as session:
+        contract = fetch_contract(session, say_waiting("a learner at the hub"))
         resolved = accept_contract(contract, tuple(settings or ()))
         folder = (spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run) / base
         service = ActorService(session, contract, resolved, base, folder, chosen)
@@ -90,15 +90,15 @@ def actor(
             service.close()
 
 
-def _say_waiting(address: str) -> Callable[[float], None]:
-    """Tells every five seconds that the hub is missing."""
+def say_waiting(whom: str) -> Callable[[float], None]:
+    """Tells every five seconds who is missing."""
     said = -5.0
 
     def say(waited: float) -> None:
         nonlocal said
         if waited - said >= 5.0:
             said = waited
-            log.info("waiting for the hub at %s since %.0f s", address, waited)
+            log.info("waiting for %s since %.0f s", whom, waited)
 
     return say
 

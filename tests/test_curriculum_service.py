@@ -1,0 +1,280 @@
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import zenoh
+from typer.testing import CliRunner
+
+from common.bus import Keys, QueryServer, RefusedError, ask, ask_bytes, open_client, open_hub, publish
+from common.config import Config
+from common.contract import make_contract
+from common.delivery import Sender, Spool, pack_header
+from common.errors import UsageError
+from common.messages import (
+    Acknowledgement,
+    Candidates,
+    Message,
+    Origin,
+    Outcome,
+    Proposal,
+    Proposals,
+    TaskQuery,
+    Version,
+    decode,
+    encode,
+)
+from common.weights import pack
+from curriculum.service import CurriculumService
+from deploy.cli.main import app
+from learner.sac import SAC
+from tests.helpers import small_config, wait_until
+from tests.test_curriculum import make_candidate
+
+CONFIG = small_config("curriculum.gate.window=4")
+OPEN = small_config("curriculum.gate.enabled=false")
+KEYS = Keys("run-1")
+DIGEST = make_contract("run-1", CONFIG).digest
+
+
+@pytest.fixture
+def started(hub: zenoh.Session) -> Iterator[Callable[..., CurriculumService]]:
+    """Starts a curriculum on the hub: no learner, no actor."""
+    services: list[CurriculumService] = []
+
+    def start(
+        config: Config = CONFIG, digest: dict[str, str] | None = None, folder: Path | None = None
+    ) -> CurriculumService:
+        services.append(CurriculumService(hub, "run-1", config, digest, folder))
+        return services[-1]
+
+    yield start
+    for service in services:
+        with suppress(zenoh.ZError):  # the test has closed it
+            service.close()
+
+
+def query(client: zenoh.Session, cell: int = 0, count: int = 1, key: str = KEYS.task) -> list[Proposal]:
+    return ask(client, key, TaskQuery(cell=cell, t=0, count=count), Proposals).tasks
+
+
+def deliver(client: zenoh.Session, key: str, message: Message, seq: int, boot: str = "b1") -> Acknowledgement:
+    """Sends a message as an actor does, and again under the same number if called again."""
+    payload = encode(message)
+    header = pack_header(Origin(actor="a1", boot=boot, seq=seq), payload)
+    return decode(Acknowledgement, ask_bytes(client, key, payload, header))
+
+
+def outcome_of(proposal: Proposal, success: bool = True, digest: dict[str, str] = DIGEST) -> Outcome:
+    return Outcome(
+        digest=digest,
+        proposal=proposal.id,
+        task=proposal.task,
+        properties=proposal.properties,
+        q=proposal.q,
+        success=success,
+        category=proposal.category,
+    )
+
+
+def test_tasks_are_proposed_without_a_learner(client, started):
+    started()
+    for cell in (0, 8):
+        (proposal,) = query(client, cell)
+        assert proposal.task.cell == cell
+        assert proposal.category == "gate"
+
+
+def test_five_tasks_are_proposed_at_once_and_by_a_query_that_does_not_know_the_run(client, started):
+    started()
+    tasks = query(client, cell=3, count=5, key=Keys("*").task)
+    assert [p.task.cell for p in tasks] == [3] * 5
+    assert len({p.task.seed for p in tasks}) == len({p.id for p in tasks}) == 5
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"junk" * 100, encode(TaskQuery(cell=1))[:-3], b"\x93\x01\xa9TaskQuery\x81\xa4cell\x63"],
+)
+def test_malformed_queries_are_refused_and_the_service_goes_on(client, started, payload):
+    started()
+    for key in (KEYS.task, KEYS.result, KEYS.candidates):
+        with pytest.raises(RefusedError):
+            ask_bytes(client, key, payload)
+    assert len(query(client, count=2)) == 2
+
+
+def test_impossible_cell_is_refused_with_the_reason(client, started):
+    started()
+    wrong = encode(TaskQuery(cell=1)).replace(b"\xa4cell\x01", b"\xa4cell\x09")
+    with pytest.raises(RefusedError, match=r"TaskQuery\.cell: Input should be less than 9"):
+        ask_bytes(client, KEYS.task, wrong)
+
+
+def test_outcome_is_acknowledged_and_a_duplicate_counts_once(client, started):
+    service = started()
+    proposals = query(client, count=2)
+    assert not deliver(client, KEYS.result, outcome_of(proposals[0]), 0).duplicate
+    assert service.curriculum.outcomes == 1
+    for _ in range(3):
+        assert deliver(client, KEYS.result, outcome_of(proposals[0]), 0).duplicate
+    assert service.curriculum.outcomes == 1
+    assert list(service.curriculum.gate.outcomes) == [True]
+    assert not deliver(client, KEYS.result, outcome_of(proposals[1], success=False), 1).duplicate
+    assert not deliver(client, KEYS.result, outcome_of(proposals[1]), 0, boot="b2").duplicate
+    assert list(service.curriculum.gate.outcomes) == [True, False, True]
+
+
+def test_outcomes_open_the_gate_for_the_next_query(client, started):
+    started()
+    for seq, proposal in enumerate(query(client, count=4)):
+        assert proposal.category == "gate"
+        deliver(client, KEYS.result, outcome_of(proposal), seq)
+    assert query(client)[0].category != "gate"
+
+
+def test_candidates_are_stored_once_and_proposed(client, started):
+    service = started(OPEN)
+    message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed, cell=2) for seed in range(4)])
+    assert [deliver(client, KEYS.candidates, message, 7).duplicate for _ in range(2)] == [False, True]
+    assert service.curriculum.store.count(2) == 4
+    assert sorted(p.task.seed for p in query(client, cell=2, count=4)) == [0, 1, 2, 3]
+    assert service.curriculum.store.count(2) == 0
+
+
+def test_candidate_of_another_layout_is_refused_and_the_service_goes_on(client, started):
+    service = started(OPEN)
+    other = small_config("world.camera.size=32")
+    message = Candidates(digest={}, candidates=[make_candidate(other, 0)])
+    with pytest.raises(RefusedError, match=r"candidate visual is float16 \(16,\), expected float16 \(4,\)"):
+        deliver(client, KEYS.candidates, message, 0)
+    assert len(service.curriculum.store) == 0
+    good = Candidates(digest={}, candidates=[make_candidate(OPEN, 0)])
+    assert not deliver(client, KEYS.candidates, good, 1).duplicate
+
+
+@pytest.mark.parametrize("field", ["protocol", "encoder", "observation", "dynamics", "reward"])
+def test_message_of_a_foreign_contract_is_refused_naming_the_field(client, started, field):
+    service = started(digest=DIGEST)
+    (proposal,) = query(client)
+    foreign = DIGEST | {field: "0123"}
+    for key, message in (
+        (KEYS.result, outcome_of(proposal, digest=foreign)),
+        (KEYS.candidates, Candidates(digest=foreign, candidates=[make_candidate(CONFIG, 0)])),
+    ):
+        with pytest.raises(RefusedError, match=f"contract differs in '{field}': .* got 0123"):
+            deliver(client, key, message, 0)
+    assert (service.curriculum.outcomes, len(service.curriculum.store)) == (0, 0)
+    assert not deliver(client, KEYS.result, outcome_of(proposal), 0).duplicate, "a refusal uses no number up"
+    assert service.curriculum.outcomes == 1
+
+
+def test_damaged_payload_is_refused(client, started):
+    service = started()
+    payload = encode(outcome_of(query(client)[0]))
+    header = pack_header(Origin(actor="a1", boot="b1", seq=0), payload + b"x")
+    with pytest.raises(RefusedError, match="payload damaged"):
+        ask_bytes(client, KEYS.result, payload, header)
+    assert service.curriculum.outcomes == 0
+
+
+def test_actors_spool_is_emptied_by_the_service(client, started, tmp_path):
+    service = started()
+    sender = Sender(client, Spool(tmp_path / "spool", 2.0**20), "a1", "b1")
+    for proposal in query(client, count=6):
+        sender.put(KEYS.result, outcome_of(proposal, success=False))
+    wait_until(lambda: sender.sent == 6, what="all outcomes acknowledged")
+    assert sender.close(patience=5.0) == 0
+    assert service.curriculum.outcomes == 6
+
+
+def test_restarted_service_remembers_outcomes_and_what_came_before(client, started, tmp_path):
+    first = started(folder=tmp_path / "curriculum")
+    for seq, proposal in enumerate(query(client, count=3)):
+        deliver(client, KEYS.result, outcome_of(proposal), seq)
+    (waiting,) = query(client)
+    first.close()
+    first._token.undeclare()
+    second = started(folder=tmp_path / "curriculum")
+    assert second.curriculum.outcomes == 3
+    assert not second.curriculum.gate.open
+    assert deliver(client, KEYS.result, outcome_of(waiting), 2).duplicate, "its acknowledgement had got lost"
+    assert not deliver(client, KEYS.result, outcome_of(waiting), 3).duplicate
+    assert second.curriculum.outcomes == 4
+    assert second.curriculum.gate.open
+
+
+def test_second_curriculum_of_a_run_is_refused(started):
+    started()
+    with pytest.raises(UsageError, match="a curriculum named 'curriculum' is already connected"):
+        started()
+
+
+@contextmanager
+def running(endpoint: str) -> Iterator[CurriculumService]:
+    """A service that runs until its session is closed."""
+    with open_hub(endpoint) as hub:
+        service = CurriculumService(hub, "run-1", OPEN, DIGEST, None)
+
+        def run() -> None:
+            with suppress(zenoh.ZError):
+                service.run()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        yield service
+    thread.join(timeout=10)
+    assert not thread.is_alive()
+
+
+def test_q_follows_the_weights_that_the_learner_publishes(endpoint):
+    sac, version = SAC(OPEN), Version(epoch=1, counter=5)
+    weights = {"blob": encode(pack(version, sac.critic_state()))}
+    with running(endpoint) as service, open_client(endpoint, patience=10.0) as client:
+        _learner = QueryServer(client, KEYS.weights("critic"), lambda *_: weights["blob"])
+        message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed) for seed in range(2)])
+        deliver(client, KEYS.candidates, message, 0)
+        for newer in (version, Version(epoch=2, counter=0)):
+            weights["blob"] = encode(pack(newer, sac.critic_state()))
+            publish(client, KEYS.version, newer)
+            wait_until(
+                lambda newer=newer: service.curriculum.critic.version == newer, what=f"weights {newer}"
+            )
+            (proposal,) = query(client)
+            assert proposal.q_reason == "critic"
+            assert proposal.q is not None
+
+
+def test_command_prints_one_json_object_with_the_keys_that_programs_read(endpoint, hub, started):
+    started(OPEN)
+    command = ["curriculum", "query", "--connect", endpoint, "--cell", "3", "--count", "5", "--json"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    answer = json.loads(result.stdout)
+    assert answer.keys() == {"tasks"}
+    assert len(answer["tasks"]) == 5
+    for task in answer["tasks"]:
+        keys = [
+            "id",
+            "cell",
+            "seed",
+            "requested",
+            "category",
+            "properties",
+            "q",
+            "q_reason",
+            "f",
+            "mu",
+            "sigma",
+            "robot",
+            "dolly",
+        ]
+        assert set(keys) <= task.keys()
+        assert task["cell"] == 3
+        assert task["q"] is None
+        assert "geometry" in task["q_reason"]
+        names = {"distance", "agent_clearance", "goal_clearance", "relative_angle"}
+        assert names <= task["properties"].keys()
+        assert len(task["robot"]) == len(task["dolly"]) == 3
