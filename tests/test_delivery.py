@@ -442,7 +442,7 @@ def test_number_far_ahead_is_refused_and_changes_nothing():
     seen.add(origin(4))
     before = seen.state()
     with pytest.raises(MessageError, match="seq 200000 jumps too far ahead of 5"):
-        seen.add(origin(200_000))
+        seen.seen(origin(200_000))
     assert seen.state() == before
     assert not seen.seen(origin(200_000))
     seen.add(origin(100_005))
