@@ -444,9 +444,18 @@ def test_number_far_ahead_is_refused_and_changes_nothing():
     with pytest.raises(MessageError, match="seq 200000 jumps too far ahead of 5"):
         seen.seen(origin(200_000))
     assert seen.state() == before
-    assert not seen.seen(origin(200_000))
-    seen.add(origin(100_005))
-    assert seen.seen(origin(100_005))
+    assert not seen.seen(origin(10_005))
+    seen.add(origin(10_005))
+    assert seen.seen(origin(10_005))
+
+
+def test_incarnation_heard_for_the_first_time_may_begin_anywhere():
+    seen = DuplicateFilter()
+    assert not seen.seen(origin(5_000_000))
+    seen.add(origin(5_000_000))
+    assert seen.seen(origin(5_000_000))
+    assert not seen.seen(origin(4_999_999))  # may still arrive, late
+    assert not seen.seen(origin(5_000_001))
 
 
 def test_restored_filter_does_not_share_its_state():
