@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,37 +13,45 @@ import torch
 
 from actor.inference import Eyes, PolicyActor
 from actor.rollout import Rollout
+from common.config import Config
 from common.errors import UsageError
 from common.messages import ENDINGS, Ending, Version
-from common.networks import load_state, make_encoder
+from common.networks import Encoder, load_state, make_encoder
 from common.policy_files import load_policy
 from common.tasks import CELLS, Task
 
 CHUNK = 10
 """Tasks that a worker takes at a time."""
+SLOTS = len(CELLS)
+
+
+def load_actor(policy: Path, greedy: bool) -> tuple[Config, Encoder, PolicyActor]:
+    """What drives a policy from disk; raises UsageError when it is none, or damaged."""
+    config, tensors = load_policy(policy)
+    encoder = make_encoder(config)
+    actor = PolicyActor(config, SLOTS, np.random.default_rng(0), greedy)
+    try:
+        if not config.encoder.end_to_end:
+            load_state(tensors, encoder=encoder)
+        actor.load(Version(counter=1), tensors)
+    except ValueError as error:
+        raise UsageError(f"{policy} holds other networks than its configuration says: {error}") from None
+    for slot in range(SLOTS):
+        actor.refresh(slot)
+    return config, encoder, actor
 
 
 class Examiner:
     """Drives one policy through tasks, side by side in as many worlds as there are cells."""
 
-    def __init__(self, policy: Path, greedy: bool, seed: int) -> None:
+    def __init__(self, policy: Path, greedy: bool) -> None:
         torch.set_num_threads(1)
-        config, tensors = load_policy(policy)
-        encoder = make_encoder(config)
-        slots = min(len(CELLS), CHUNK)
-        self._actor = PolicyActor(config, slots, np.random.default_rng([seed, 4]), greedy)
-        try:
-            if not config.encoder.end_to_end:
-                load_state(tensors, encoder=encoder)
-            self._actor.load(Version(counter=1), tensors)
-        except ValueError as error:
-            raise UsageError(f"{policy} holds other networks than its configuration says: {error}") from None
-        self._rollout = Rollout(config, Eyes(config, encoder), slots, config.world.max_evaluation_steps)
-        for slot in range(slots):
-            self._actor.refresh(slot)
+        config, encoder, self._actor = load_actor(policy, greedy)
+        self._rollout = Rollout(config, Eyes(config, encoder), SLOTS, config.world.max_evaluation_steps)
 
-    def run(self, tasks: list[Task]) -> list[Ending]:
-        """How each task ended, in the tasks' order."""
+    def run(self, tasks: list[Task], rng: np.random.Generator) -> list[Ending]:
+        """How each task ended, in the tasks' order; `rng` draws the actions unless they are greedy."""
+        self._actor.rng = rng
         waiting = list(enumerate(tasks))[::-1]
         running: dict[int, int] = {}
         endings: dict[int, Ending] = {}
@@ -61,14 +68,16 @@ class Examiner:
 _examiner: Examiner | None = None
 
 
-def _start_worker(policy: Path, greedy: bool, seed: int) -> None:
+def _start_worker(policy: Path, greedy: bool) -> None:
     global _examiner
-    _examiner = Examiner(policy, greedy, seed)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    _examiner = Examiner(policy, greedy)
 
 
-def _examine(tasks: list[Task]) -> list[Ending]:
+def _examine(work: tuple[int, list[Task], int]) -> tuple[int, list[Ending]]:
     assert _examiner is not None
-    return _examiner.run(tasks)
+    index, tasks, seed = work
+    return index, _examiner.run(tasks, np.random.default_rng([seed, 4, index]))
 
 
 def evaluate(
@@ -80,18 +89,16 @@ def evaluate(
     progress: Callable[[int], None] | None = None,
 ) -> list[Ending]:
     """How each task ended, in order; `progress` hears the number done. Raises UsageError for a bad policy."""
-    load_policy(policy)  # a bad one is refused here, not in a worker
-    chunks = [tasks[i : i + CHUNK] for i in range(0, len(tasks), CHUNK)]
+    load_actor(policy, greedy)  # a bad one is refused here, not in a worker
+    chunks = [(i, tasks[i : i + CHUNK], seed) for i in range(0, len(tasks), CHUNK)]
+    endings: dict[int, list[Ending]] = {}
     context = multiprocessing.get_context("spawn")
-    start = partial(_start_worker, policy, greedy, seed)
-    results: dict[int, list[Ending]] = {}
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=start) as pool:
-        futures = {pool.submit(_examine, chunk): index for index, chunk in enumerate(chunks)}
-        for future in as_completed(futures):
-            results[futures[future]] = future.result()
+    with context.Pool(processes, _start_worker, (policy, greedy)) as pool:
+        for index, found in pool.imap_unordered(_examine, chunks):
+            endings[index] = found
             if progress:
-                progress(sum(len(endings) for endings in results.values()))
-    return [ending for index in range(len(chunks)) for ending in results[index]]
+                progress(sum(len(part) for part in endings.values()))
+    return [ending for index, *_ in chunks for ending in endings[index]]
 
 
 def rates(endings: list[Ending]) -> dict[str, float]:

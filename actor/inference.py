@@ -36,14 +36,16 @@ class LoadedPolicy:
 class PolicyActor:
     """The SAC policy on the CPU; samples its actions, or with `greedy` takes the mean's.
 
-    Before the first update of the weights it samples uniformly, which covers more than an untrained policy.
+    With `actor.uniform_start` it samples uniformly until the first update.
 
     Every slot drives with the weights that were newest when it was last refreshed, so that an episode can
     keep one policy to its end (algorithm 2).
     """
 
     def __init__(self, config: Config, slots: int, rng: np.random.Generator, greedy: bool = False) -> None:
-        self._config, self._rng, self._greedy = config, rng, greedy
+        self.rng = rng
+        self._config, self._greedy = config, greedy
+        self._uniform_start = config.actor.uniform_start and not greedy
         self.newest = self._blank(Version())
         self._in_slot = [self.newest] * slots
 
@@ -68,12 +70,12 @@ class PolicyActor:
     def act(self, observation: Observation, slots: list[int]) -> NDArray[np.float32]:
         """One forward pass for each version in use."""
         actions = np.empty((len(slots), 2), np.float32)
-        noise = self._rng.standard_normal(actions.shape, np.float32)
+        noise = self.rng.standard_normal(actions.shape, np.float32)
         loaded = [self._in_slot[slot] for slot in slots]
         for one in {id(item): item for item in loaded}.values():
             mine = np.array([item is one for item in loaded])
-            if not self._greedy and one.version.counter == 0:
-                actions[mine] = self._rng.uniform(-1, 1, (mine.sum(), 2))
+            if self._uniform_start and one.version.counter == 0:
+                actions[mine] = self.rng.uniform(-1, 1, (mine.sum(), 2))
                 continue
             with torch.inference_mode():
                 flat = one.perception(Observation(*(part[mine] for part in observation)))

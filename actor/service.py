@@ -53,11 +53,11 @@ class ActorService:
         self.config, self.contract, self.name = config, contract, name
         self.keys = Keys(contract.run)
         self._session = session
-        boot = uuid.uuid4().hex[:12]
-        # the boot id in the seed: a restarted actor drives other episodes than its predecessor
-        seeds = np.random.SeedSequence([config.seed, *boot.encode()]).spawn(2)
-        self._rng = np.random.default_rng(seeds[0])
         self._token = announce(session, self.keys, "actor", name)
+        boot = uuid.uuid4().hex[:12]
+        # each actor, and each of its lives, drives other episodes
+        seeds = np.random.SeedSequence([config.seed, count_life(spool), *name.encode()]).spawn(2)
+        self._rng = np.random.default_rng(seeds[0])
         eyes = Eyes(config, contract_encoder(contract, config))
         self._rollout = Rollout(config, eyes, config.actor.worlds, config.world.max_episode_steps)
         self._actor = PolicyActor(config, len(self._rollout), np.random.default_rng(seeds[1]))
@@ -209,3 +209,12 @@ class ActorService:
                 **{f"task_{key}": value for key, value in self._categories.items()},
             }
         )
+
+
+def count_life(folder: Path) -> int:
+    """The how many-th incarnation of an actor this is, counted in its spool folder from 0."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "lives"
+    lives = int(file.read_text()) if file.exists() and file.read_text().isdigit() else 0
+    file.write_text(str(lives + 1))
+    return lives

@@ -166,18 +166,24 @@ class QueryServer:
     def _serve(self) -> None:
         while (query := self._inbox.get()) is not None:
             try:
-                payload = query.payload.to_bytes() if query.payload is not None else b""
-                attachment = query.attachment.to_bytes() if query.attachment is not None else b""
-                answer = zenoh.ZBytes(self._handler(payload, attachment))
-            except MessageError as error:
-                self._refuse(query, str(error))
-            except Exception:
-                log.exception("error while answering %s", query.key_expr)
-                self._refuse(query, INTERNAL_ERROR)
-            else:
-                with query:
-                    query.reply(self._key, answer)  # the query's own expression may hold wildcards
+                self._answer(query)
+            except Exception:  # this thread must outlive whatever one query brings, a lost session included
+                log.exception("could not answer %s", self._key)
             query = None  # an undropped query would hold its reply back until the timeout
+
+    def _answer(self, query: zenoh.Query) -> None:
+        try:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            attachment = query.attachment.to_bytes() if query.attachment is not None else b""
+            answer = zenoh.ZBytes(self._handler(payload, attachment))
+        except MessageError as error:
+            self._refuse(query, str(error))
+        except Exception:
+            log.exception("error while answering %s", query.key_expr)
+            self._refuse(query, INTERNAL_ERROR)
+        else:
+            with query:
+                query.reply(self._key, answer)  # the query's own expression may hold wildcards
 
     def _refuse(self, query: zenoh.Query, reason: str) -> None:
         self.refused[reason.split(":")[0][:40] if len(self.refused) < 100 else "other"] += 1
@@ -291,16 +297,26 @@ def publish(session: zenoh.Session, key: str, message: Message) -> None:
     )
 
 
-def subscribe(session: zenoh.Session, key: str, kind: type[M], handler: Callable[[M], None]) -> object:
-    """Calls `handler`, which must not block, for every well-formed message; keep the returned object."""
+class Subscription:
+    """Calls `handler`, which must not block, for well-formed messages; counts the others in `ignored`."""
 
-    def receive(sample: zenoh.Sample) -> None:
-        try:
-            handler(decode(kind, sample.payload.to_bytes()))
-        except MessageError as error:
-            log.warning("ignored a message on %s: %s", sample.key_expr, error)
+    def __init__(self, session: zenoh.Session, key: str, kind: type[M], handler: Callable[[M], None]) -> None:
+        self.ignored = 0
+        self._logged = 0.0
 
-    return session.declare_subscriber(key, receive)
+        def receive(sample: zenoh.Sample) -> None:
+            try:
+                handler(decode(kind, sample.payload.to_bytes()))
+            except MessageError as error:
+                self._ignore(str(sample.key_expr), error)
+
+        self._subscriber = session.declare_subscriber(key, receive)
+
+    def _ignore(self, key: str, error: MessageError) -> None:
+        self.ignored += 1
+        if time.monotonic() - self._logged >= 1.0:
+            self._logged = time.monotonic()
+            log.warning("ignored a message on %s: %s", key, error)
 
 
 def announce(session: zenoh.Session, keys: Keys, role: str, name: str) -> object:

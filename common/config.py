@@ -225,6 +225,12 @@ class ReplayConfig(Section):
     warmup_steps: Count = 2_000
     """Transitions stored before the first update."""
 
+    @model_validator(mode="after")
+    def _can_begin(self) -> ReplayConfig:
+        if 2 * self.warmup_steps > self.capacity:
+            raise ValueError(f"warmup_steps must be at most half the capacity of {self.capacity}")
+        return self
+
 
 class LearnerConfig(Section):
     """The learner process."""
@@ -245,6 +251,8 @@ class ActorConfig(Section):
 
     worlds: Annotated[int, Field(ge=1, le=64)] = 9
     """Worlds of a process, one per cell in turn (the paper's nine agents)."""
+    uniform_start: bool = True
+    """Uniform actions until the first update; they cover more than an untrained policy."""
     refresh: Literal["episode", "step"] = "step"
     """When a world takes newer weights; `episode`: one policy per episode (algorithm 2)."""
     spool_megabytes: Positive = 256.0
@@ -255,6 +263,20 @@ class ActorConfig(Section):
     """Candidate starts that each world encodes before its first episode; one per episode after that."""
 
 
+class FavourableRanges(StartRanges):
+    """Near and straight, the nearest half under the dolly.
+
+    From 1.5 m, hardly one random drive in a thousand ends in success, and the agent learns that an early
+    contact is the cheapest ending.
+    """
+
+    distance_min: Positive = 0.4
+    distance_max: Positive = 2.0
+    yaw: Annotated[float, Field(ge=0, le=180)] = 10.0
+    bearing: Annotated[float, Field(ge=0, le=15)] = 4.0
+    dolly_yaw: Annotated[float, Field(ge=0, le=15)] = 4.0
+
+
 class GateConfig(Section):
     """Favourable starts until they succeed (the cure proposed in section 5.3; ours to define)."""
 
@@ -263,11 +285,7 @@ class GateConfig(Section):
     """Outcomes of favourable starts that are judged."""
     threshold: Fraction = 0.65
     """Success among them that opens the gate."""
-    ranges: StartRanges = StartRanges(
-        distance_min=0.4, distance_max=2.0, yaw=10.0, bearing=4.0, dolly_yaw=4.0
-    )
-    """Near and straight, the nearest half under the dolly: from 1.5 m, hardly one random drive in a thousand
-    ends in success, and the agent learns that an early contact is the cheapest ending."""
+    ranges: FavourableRanges = FavourableRanges()
 
 
 class CurriculumConfig(Section):

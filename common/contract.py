@@ -23,6 +23,10 @@ from common.errors import UsageError
 from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
 from common.networks import Encoder, load_state, make_encoder, state_of
 from common.observation import HISTORY
+from common.tasks import CELLS
+
+WORLD_VERSION = 1
+"""To be counted up by whoever changes how a scene is drawn, how the robot drives or what ends an episode."""
 
 AGREED = {
     "observation": ("world.camera", "world.lidar", "encoder"),
@@ -44,6 +48,7 @@ def digest(config: Config, encoder: bytes) -> dict[str, str]:
         field: [reduce(getitem, path.split("."), values) for path in paths] for field, paths in AGREED.items()
     }
     settings["observation"].append(HISTORY)
+    settings["dynamics"] += [WORLD_VERSION, repr(CELLS)]
     return {
         "protocol": str(SCHEMA_VERSION),
         "encoder": _short(values["encoder"]) if config.encoder.end_to_end else _short(encoder),

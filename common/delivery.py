@@ -79,8 +79,11 @@ class Spool:
 
     def first(self) -> tuple[Path, str, bytes, bytes] | None:
         """The oldest message: its file, key, header and payload; unreadable ones are set aside and logged."""
-        while self._waiting:
-            path = next(iter(self._waiting))
+        while True:
+            with self._lock:
+                path = next(iter(self._waiting), None)
+            if path is None:
+                return None
             try:
                 key, header, payload = msgpack.unpackb(path.read_bytes())
                 unpack_header(header, payload)
@@ -90,7 +93,6 @@ class Spool:
                 self._forget(path)
                 if path.exists():
                     path.rename(path.with_suffix(".bad"))
-        return None
 
     def remove(self, path: Path) -> None:
         """Drops a message that was acknowledged or refused for good."""
@@ -132,6 +134,14 @@ class Sender:
             self._seq += 1
 
     def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._deliver()
+            except Exception:  # a full disk, say: the spool stays as it is, and is tried again
+                log.exception("delivery stopped; it goes on in a second")
+                self._stop.wait(1.0)
+
+    def _deliver(self) -> None:
         pause, jitter = 0.1, random.Random()
         while not self._stop.is_set():
             self.spool.changed.clear()

@@ -41,7 +41,9 @@ def _to_array(value: Any) -> NDArray[Any]:
     if dtype not in ("float16", "float32", "float64", "uint8"):
         raise ValueError(f"dtype {dtype!r} is not allowed")
     if not (
-        isinstance(shape, list) and 1 <= len(shape) <= 5 and all(type(n) is int and n >= 0 for n in shape)
+        isinstance(shape, list)
+        and 1 <= len(shape) <= 5
+        and all(type(n) is int and 0 <= n < 2**31 for n in shape)
     ):
         raise ValueError("a shape is a list of one to five non-negative integers")
     count = 1

@@ -75,7 +75,7 @@ CELLS: tuple[Cell, ...] = (
 
 
 class Task(Section):
-    """One episode's start: `seed` fixes geometry, textures, light and noise within the ranges."""
+    """One episode's start: `seed` fixes geometry, textures and light within the ranges."""
 
     cell: Annotated[int, Field(ge=0, lt=len(CELLS))]
     seed: Annotated[int, Field(ge=0, lt=2**53)]
@@ -116,7 +116,7 @@ def check_cell(cell: int) -> int:
 
 
 def random_stream(task: Task, purpose: int) -> np.random.Generator:
-    """The task's own random numbers for one purpose (0 geometry, 1 appearance, 2 noise)."""
+    """The task's own random numbers for one purpose (0 geometry, 1 appearance)."""
     return np.random.default_rng([task.seed, task.cell, purpose])
 
 

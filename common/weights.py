@@ -13,7 +13,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from common.bus import Keys, NoAnswerError, RefusedError, ask, subscribe
+from common.bus import Keys, NoAnswerError, RefusedError, Subscription, ask
 from common.messages import MessageError, Nothing, Version, WeightsBlob
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ class WeightsPuller:
         self.newest: tuple[Version, dict[str, Tensor]] | None = None
         self._session, self._key, self._rest = session, keys.weights(kind), rest
         self._heard: queue.SimpleQueue[Version] = queue.SimpleQueue()
-        self._subscription = subscribe(session, keys.version, Version, self._heard.put)
+        self._subscription = Subscription(session, keys.version, Version, self._heard.put)
         threading.Thread(target=self._run, name="weights", daemon=True).start()
 
     def _run(self) -> None:

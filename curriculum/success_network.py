@@ -80,7 +80,8 @@ class SuccessNetwork:
         for _ in range(self.config.fit_steps):
             rows = np.array(self._reservoir if self.plus else self._fresh)
             real = ~np.isnan(rows[:, -2])
-            rows = rows[real] if 2 * real.sum() >= len(rows) else rows[~real]
+            enough = real.sum() >= (self.config.batch_size if self.plus else 1)
+            rows = rows[real] if enough or real.all() else rows[~real]
             if self.plus:
                 rows = rows[self._rng.integers(len(rows), size=self.config.fit_batch)]
             logits = self.net(self._scale(rows[:, :-1])).squeeze(-1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.config import Config
+from common.errors import UsageError
 from common.messages import Candidate, MessageError, Version
 from common.networks import Perception, Policy, TwinCritic, initial_q, load_state
 from common.observation import Observation, ObservationLayout
@@ -85,8 +86,13 @@ class TaskStore:
         scene = build_scene(task, self._config.world)
         return Entry(task, scene, geometric_properties(task, scene), observed)
 
-    def add(self, candidate: Candidate) -> None:
-        """Stores a candidate; raises MessageError when it is not of this run's layout."""
+    def add(self, candidates: list[Candidate]) -> None:
+        """Stores candidates, all or none; raises MessageError for one that is not of this run's layout."""
+        entries = [self._checked(candidate) for candidate in candidates]
+        for entry in entries:
+            self._cells[entry.task.cell].append(entry)
+
+    def _checked(self, candidate: Candidate) -> Entry:
         expected = {
             "visual": (self._layout.row_shape, self._layout.row_dtype),
             "lidar": ((self._layout.lidar,), "float16"),
@@ -97,7 +103,10 @@ class TaskStore:
                 raise MessageError(
                     f"candidate {name} is {array.dtype} {array.shape}, expected {dtype} {shape}"
                 )
-        self._cells[candidate.task.cell].append(self.make_entry(candidate.task, candidate))
+        try:
+            return self.make_entry(candidate.task, candidate)
+        except UsageError as error:
+            raise MessageError(f"candidate task: {error}") from None
 
     def sample(self, cell: int, count: int, rng: np.random.Generator) -> list[Entry]:
         """Up to `count` different candidates of a cell, in random order."""

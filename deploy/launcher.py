@@ -36,8 +36,9 @@ class Child:
     log_file: Path
     process: subprocess.Popen[bytes] | None = None
     restarts: int = 0
+    may_finish: bool = False
+    """Whether exit code 0 is its proper end; otherwise any end is a death."""
     finished: bool = False
-    """True once it has ended by itself with exit code 0."""
     next_start: float = 0.0
     started: float = 0.0
     back_off: float = 0.5
@@ -91,10 +92,10 @@ class Supervisor:
             if code is None:
                 if now - child.started > 60:
                     child.back_off = 0.5
-            elif code == 0:
+            elif code == 0 and child.may_finish:
                 child.finished = True
             elif child.next_start == 0.0:
-                if code == 2:
+                if code == 2 and child.restarts == 0:
                     raise UsageError(f"{child.name}: {child.last_words().removeprefix('error: ')}")
                 child.next_start = now + child.back_off
                 self._report(

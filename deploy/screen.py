@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 
-from common.bus import Keys, subscribe, watch_members
+from common.bus import Keys, Subscription, watch_members
 from common.messages import ENDINGS, Stat
 
 Value = float | int | str
@@ -26,7 +26,7 @@ class Monitor:
         self.stats: dict[tuple[str, str], Stat] = {}
         self.alive: dict[tuple[str, str], bool] = {}
         self._subscriptions = (
-            subscribe(session, keys.stat("*", "*"), Stat, self._hear),
+            Subscription(session, keys.stat("*", "*"), Stat, self._hear),
             watch_members(session, keys, self._member),
         )
 
@@ -96,7 +96,7 @@ class Screen:
             f"success/100 {_share(v, 'charts/success_100')}  success/500 {_share(v, 'charts/success_500')}  "
             f"endings {_mix(v, 'endings/')}  tasks {_mix(v, 'tasks/')}  replay {v['replay']}  "
             f"staleness {_number(v, 'charts/staleness')}  alpha {_number(v, 'losses/alpha')}  "
-            f"q {_number(v, 'losses/qf_values')}  gate {_gate(gate)}  "
+            f"q {_number(v, 'losses/qf_values')}  refused {v['refused']}  gate {_gate(gate)}  "
             f"processes {alive}"
         )
 
@@ -116,6 +116,7 @@ class Screen:
             ("staleness", f"{_number(v, 'charts/staleness')} updates"),
             ("temperature", _number(v, "losses/alpha")),
             ("Q", _number(v, "losses/qf_values")),
+            ("refused messages", str(v.get("refused", 0))),
             ("gate", _gate(self._monitor.curriculum)),
         ]
         for name, value in rows:

@@ -68,9 +68,10 @@ class RunDirectory:
         write_atomically(identity, json.dumps(values))
         return int(values["epoch"])
 
-    def save(self, sac: SAC, env_steps: int) -> None:
-        """A checkpoint of all that learns; keeps the newest few."""
+    def save(self, sac: SAC, frozen: dict[str, Tensor], env_steps: int) -> None:
+        """A checkpoint of all that learns and of what is frozen; keeps the newest few."""
         networks, moments = sac.state()
+        networks |= frozen
         state = {"updates": sac.updates, "env_steps": env_steps}
         folder = self.folder / "checkpoints" / f"{sac.updates:09d}"
         self._write(folder, {NETWORKS: networks, "optimizers.safetensors": moments}, state)

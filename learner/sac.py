@@ -46,7 +46,7 @@ def policy_loss(q: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
 
 
 def temperature_loss(log_alpha: Tensor, log_density: Tensor, target_entropy: float) -> Tensor:
-    """J(alpha) = mean of -alpha (log pi(a | s) + target entropy), with alpha's logarithm as the variable."""
+    """Mean of -log(alpha) (log pi(a | s) + target entropy): J(alpha), its factor by custom the logarithm."""
     return -(log_alpha * (log_density + target_entropy)).mean()
 
 

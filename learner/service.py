@@ -17,7 +17,7 @@ import zenoh
 from torch.utils.tensorboard import SummaryWriter
 
 from common.bus import Keys, QueryServer, announce, publish, serve
-from common.contract import check_digest, make_contract
+from common.contract import check_digest, contract_encoder, make_contract
 from common.delivery import unpack_header
 from common.errors import UsageError
 from common.messages import (
@@ -31,6 +31,7 @@ from common.messages import (
     decode,
     encode,
 )
+from common.networks import state_of
 from common.observation import ObservationLayout
 from common.telemetry import Rate, Reporter
 from common.weights import pack
@@ -104,6 +105,8 @@ class LearnerService:
         )
         self.sac = SAC(config)
         self.contract = make_contract(run.name, config)
+        frozen = not config.encoder.end_to_end
+        self._frozen = state_of(encoder=contract_encoder(self.contract, config)) if frozen else {}
         self._epoch = run.next_epoch()
         self._log = EpisodeLog(run.folder / "log", config.replay.capacity)
         self.progress = Progress()
@@ -112,7 +115,8 @@ class LearnerService:
         self._blobs: dict[str, bytes] = {}
         self._blobs_lock = threading.Lock()
         self._publish()
-        self._snapshot_due = self._log.env_steps + config.learner.snapshot_steps
+        every = config.learner.snapshot_steps
+        self._snapshot_due = (self._log.env_steps // every + 1) * every
         self._servers = [
             QueryServer(session, self.keys.trajectory, self._take),
             serve(session, self.keys.contract, Nothing, self._answer_contract),
@@ -122,6 +126,7 @@ class LearnerService:
         self._reporter = Reporter(session, self.keys, "learner", "learner")
         self._board = SummaryWriter(str(run.folder / "tensorboard"))
         self._began: float | None = None
+        self._ended = time.monotonic()
         self._first_update_from = self._log.env_steps
         self._updates_before = self.sac.updates
 
@@ -141,7 +146,7 @@ class LearnerService:
                 self._publish()
             if now - last_checkpoint >= self.config.learner.checkpoint_seconds:
                 last_checkpoint = now
-                self.run_directory.save(self.sac, self._log.env_steps)
+                self.run_directory.save(self.sac, self._frozen, self._log.env_steps)
             if self._log.env_steps >= self._snapshot_due:
                 self._snapshot(f"{self._log.env_steps:09d}")
                 self._snapshot_due += self.config.learner.snapshot_steps
@@ -156,11 +161,12 @@ class LearnerService:
 
     def close(self) -> None:
         """Takes no more episodes, then writes checkpoint, final snapshot and summary."""
+        self._ended = time.monotonic()
         for server in self._servers:
             server.close()
         self._ingest()
         self._log.close()
-        self.run_directory.save(self.sac, self._log.env_steps)
+        self.run_directory.save(self.sac, self._frozen, self._log.env_steps)
         self._snapshot("final")
         self._board.close()
         write_atomically(self.run_directory.folder / "summary.json", json.dumps(self.summary(), indent=1))
@@ -172,7 +178,7 @@ class LearnerService:
             "env_steps": self._log.env_steps,
             "episodes": self._log.episodes,
             "updates": self.sac.updates,
-            "minutes": round((time.monotonic() - self._began) / 60, 3) if self._began else 0.0,
+            "minutes": round((self._ended - self._began) / 60, 3) if self._began else 0.0,
             "figures": {name: round(value, 5) for name, value in self.progress.figures().items()},
             "refused": dict(sum((server.refused for server in self._servers), Counter())),
         }
@@ -249,6 +255,8 @@ class LearnerService:
             config.sac.batch_size, config.sac.n_step, config.sac.gamma, start + done * (end - start)
         )
         losses, errors = self.sac.update(batch)
+        if not math.isfinite(losses.critic):
+            raise ArithmeticError(f"the critic's loss is {losses.critic} at update {self.sac.updates}")
         self.replay.update_priorities(batch, errors)
         self.progress.losses.append(losses)
 
@@ -270,11 +278,7 @@ class LearnerService:
         return self.contract
 
     def _snapshot(self, name: str) -> None:
-        networks = self.sac.policy_state()
-        if not self.config.encoder.end_to_end:
-            from safetensors.torch import load
-
-            networks |= load(self.contract.encoder)
+        networks = self.sac.policy_state() | self._frozen
         state = {"updates": self.sac.updates, "env_steps": self._log.env_steps}
         self.run_directory.snapshot(name, networks, state)
 

@@ -73,5 +73,10 @@ def tiny_episode(
 
 def small_config(*overrides: str) -> Config:
     """Preset `smoke` with an observation of 32 numbers: everything is real, a row is a few bytes."""
-    small = ("world.camera.size=16", "world.lidar.beams=2", "network.hidden=[16, 16]")
+    small = (
+        "world.camera.size=16",
+        "world.lidar.beams=2",
+        "network.hidden=[16, 16]",
+        "replay.warmup_steps=1",
+    )
     return resolve("smoke", overrides=(*small, *overrides))

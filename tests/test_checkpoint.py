@@ -22,7 +22,7 @@ def saved(run: RunDirectory, updates: int) -> SAC:
     sac.updates = updates
     with torch.no_grad():
         sac.log_alpha.fill_(updates)
-    run.save(sac, 10 * updates)
+    run.save(sac, {"encoder.frozen": torch.ones(3)}, 10 * updates)
     return sac
 
 

@@ -112,7 +112,7 @@ def test_doctor_prints_one_json_object_last_on_stdout_even_with_pybullet_loaded(
     found = json.loads(done.stdout)
     assert {"versions", "cores", "pybullet_numpy", "torch_threads", "hub", "free_disk_gb"} <= set(found)
     assert found["pybullet_numpy"] is True
-    assert found["hub"] is None
+    assert set(found["hub"]) >= {"endpoint", "answers"}
 
 
 def test_doctor_says_that_a_hub_is_silent_with_exit_code_1(monkeypatch, capsys, endpoint):

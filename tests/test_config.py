@@ -260,7 +260,7 @@ def test_override_cannot_relabel_the_preset_or_the_variant(setting):
         ("network.lidar_branch=[7, 5]", "network.lidar_branch", (7, 5)),
         ("curriculum.gate={enabled=false, window=5}", "curriculum.gate.window", 5),
         ("world.reward.dolly_contact=-10", "world.reward.dolly_contact", -10.0),
-        ("replay.capacity=1_000", "replay.capacity", 1000),
+        ("replay.capacity=10_000", "replay.capacity", 10_000),
     ],
 )
 def test_override_takes_toml_values_and_bare_words(setting, key, expected):

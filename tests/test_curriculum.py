@@ -13,7 +13,7 @@ from common.networks import Perception, Policy, TwinCritic, state_of
 from common.observation import ObservationLayout
 from common.tasks import GeometricProperties, Task, build_scene, geometric_properties
 from curriculum.adaptive_filtering import task_type_probabilities
-from curriculum.service import Curriculum, Gate
+from curriculum.curriculum import Curriculum, Gate
 from curriculum.task_store import CriticView, Entry, TaskStore
 from tests.helpers import small_config
 
@@ -71,7 +71,7 @@ def with_candidates(config: Config, count: int, cell: int = 0) -> tuple[Curricul
     curriculum = Curriculum(config)
     candidates = {seed: make_candidate(config, seed, cell) for seed in range(count)}
     for candidate in candidates.values():
-        curriculum.store.add(candidate)
+        curriculum.store.add([candidate])
     return curriculum, candidates
 
 
@@ -141,7 +141,7 @@ def test_tasks_before_the_gate_are_near_and_straight_and_carry_its_name():
         proposal = curriculum.propose(cell, 0)
         assert proposal.category == "gate"
         assert proposal.task.cell == cell
-        assert proposal.task.start == curriculum.config.curriculum.gate.ranges
+        assert proposal.task.start.model_dump() == curriculum.config.curriculum.gate.ranges.model_dump()
         assert proposal.properties.distance <= proposal.task.start.distance_max
         assert (proposal.q, proposal.f, proposal.mu, proposal.sigma) == (None, None, None, None)
         assert proposal.q_reason == "not used by gate"
@@ -309,7 +309,7 @@ def test_proposals_to_the_letter_meet_algorithm_1():
 def test_frontier_of_plus_lies_near_one_half_when_f_spreads():
     curriculum = Curriculum(small_config(OPEN, "curriculum.easy_share=0"))
     for seed in range(100):
-        curriculum.store.add(make_candidate(PLUS, seed))
+        curriculum.store.add([make_candidate(PLUS, seed)])
     train(curriculum, 640)
     proposals = [curriculum.propose(0, 0) for _ in range(5)]
     assert {p.category for p in proposals} == {"frontier"}
@@ -339,7 +339,7 @@ def test_proposed_candidates_leave_the_database():
 def test_candidates_are_proposed_in_their_own_cell_only():
     curriculum = Curriculum(PLUS)
     for seed in range(6):
-        curriculum.store.add(make_candidate(PLUS, seed, cell=seed % 2))
+        curriculum.store.add([make_candidate(PLUS, seed, cell=seed % 2)])
     assert [curriculum.store.count(cell) for cell in range(3)] == [3, 3, 0]
     assert {curriculum.propose(1, 0).task.seed for _ in range(3)} == {1, 3, 5}
 
@@ -351,8 +351,8 @@ def test_database_holds_a_bounded_number_per_cell_and_the_oldest_make_room():
     config = small_config(OPEN, "curriculum.store_per_cell=5")
     store = TaskStore(config)
     for seed in range(8):
-        store.add(make_candidate(config, seed))
-    store.add(make_candidate(config, 100, cell=1))
+        store.add([make_candidate(config, seed)])
+    store.add([make_candidate(config, 100, cell=1)])
     assert (len(store), store.count(0), store.count(1)) == (6, 5, 1)
     kept = store.sample(0, 100, np.random.default_rng(0))
     assert sorted(entry.task.seed for entry in kept) == [3, 4, 5, 6, 7]
@@ -361,7 +361,7 @@ def test_database_holds_a_bounded_number_per_cell_and_the_oldest_make_room():
 def test_samples_are_different_candidates_in_random_order():
     store, rng = TaskStore(PLUS), np.random.default_rng(0)
     for seed in range(20):
-        store.add(make_candidate(PLUS, seed))
+        store.add([make_candidate(PLUS, seed)])
     first: Counter[int] = Counter()
     for _ in range(400):
         seeds = [entry.task.seed for entry in store.sample(0, 5, rng)]
@@ -381,9 +381,10 @@ def test_candidate_of_another_layout_is_refused_naming_the_field():
             with pytest.raises(
                 MessageError, match=rf"candidate {name} is .*, expected \(4,\)|expected float16"
             ):
-                store.add(good.model_copy(update={name: array}))
+                store.add([good, good.model_copy(update={name: array})])
     assert len(store) == 0
-    store.add(good)
+    assert len(store) == 0  # all or none
+    store.add([good])
     assert len(store) == 1
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import Keys, subscribe
+from common.bus import Keys, Subscription
 from common.messages import Stat
 from common.telemetry import Reporter
 from tests.helpers import wait_until
@@ -41,7 +41,7 @@ def test_a_signal_ends_a_process_cleanly_with_its_session_closed(endpoint, numbe
 def test_figures_are_due_at_once_and_then_not_again_within_the_second(hub, client):
     got: list[Stat] = []
     keys = Keys("run-1")
-    subscriber = subscribe(hub, keys.stat("*", "*"), Stat, got.append)
+    subscriber = Subscription(hub, keys.stat("*", "*"), Stat, got.append)
     reporter = Reporter(client, keys, "learner", "main")
     assert reporter.due
     reporter.report({"updates": 0})

@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table
 
 from common.bus import Keys, ask, open_client, open_hub
-from common.contract import accept_contract, fetch_contract
 from common.errors import UsageError
 from common.messages import Proposals, TaskQuery
 from common.tasks import check_cell
@@ -47,10 +46,16 @@ def serve_curriculum(
     insecure: options.Insecure = False,
 ) -> None:
     """Answer task queries: beside a learner (--connect), or alone (--listen, the default)."""
+    from common.contract import accept_contract, fetch_contract
     from curriculum.service import CurriculumService
 
     if connect and listen:
         raise UsageError("--connect and --listen exclude each other: join a learner, or stand alone")
+    if connect and any((preset, variant, config, seed is not None)):
+        raise UsageError("beside a learner the configuration is the learner's; only --set may differ from it")
+    known = run is None or (run / "run.json").exists() or (run / "curriculum").exists()
+    if run and not known and run.exists() and any(run.iterdir()):
+        raise UsageError(f"{run} is not empty and no run directory; choose another --run")
     folder = run / "curriculum" if run else None
     start_logging()
     exit_on_signals()

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import typer
 
 from common.bus import NoAnswerError, RefusedError, open_client
-from common.contract import fetch_contract
 from common.messages import SCHEMA_VERSION, MessageError
 from deploy.cli import options
 
@@ -21,20 +20,20 @@ PACKAGES = ("navaclq", "eclipse-zenoh", "torch", "pybullet", "numpy", "onnxrunti
 
 
 def doctor(
-    connect: Annotated[str | None, typer.Option(help="Endpoint of a hub to ask; exit 1 when silent.")] = None,
+    connect: Annotated[str | None, typer.Option(help="Endpoint of the hub; exit 1 if silent.")] = None,
     insecure: options.Insecure = False,
     as_json: options.Json = False,
 ) -> None:
     """Check versions, cores, pybullet's numpy support, torch's threads, free disk, and a named hub."""
-    address = options.endpoint(connect, insecure) if connect else None
+    address = options.endpoint(connect or options.DEFAULT_ENDPOINT, insecure)
     found = examine()
-    found["hub"] = _ask_hub(address) if address else None
+    found["hub"] = _ask_hub(address)
     if as_json:
         options.print_json(found)
     else:
         for key, value in found.items():
             sys.stdout.write(f"{key:18} {value}\n")
-    if address and not found["hub"]["answers"]:
+    if connect and not found["hub"]["answers"]:
         raise typer.Exit(1)
 
 
@@ -59,9 +58,11 @@ def examine() -> dict[str, Any]:
 
 
 def _ask_hub(address: str) -> dict[str, Any]:
+    from common.contract import fetch_contract
+
     answer: dict[str, Any] = {"endpoint": address, "answers": False}
     try:
-        with open_client(address, patience=3.0) as session:
+        with open_client(address, patience=1.0) as session:
             answer["answers"] = True
             answer["run"] = fetch_contract(session, patience=1.0).run
     except (NoAnswerError, RefusedError, MessageError) as error:

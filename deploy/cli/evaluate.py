@@ -13,23 +13,20 @@ from rich.progress import Progress
 
 from common.config import resolve
 from common.errors import UsageError
-from common.policy_files import CONFIG, load_policy
 from common.tasks import suite as suite_tasks
 from deploy.cli import options
 
 
 def find_policy(path: Path) -> Path:
-    """The policy folder meant by `path`: itself, or of a run its final snapshot or newest checkpoint."""
+    """The policy folder meant by `path`: itself, or of a run its newest snapshot."""
     if not path.exists():
         raise UsageError(f"policy {path} does not exist; give a run directory, a checkpoint or a snapshot")
     if not (path / "run.json").exists():
         return path
-    if (path / "snapshots" / "final" / CONFIG).exists():
-        return path / "snapshots" / "final"
-    found = sorted((path / "snapshots").glob("[0-9]*"))
+    found = [p for p in (path / "snapshots").glob("*") if p.suffix != ".part"]
     if not found:
         raise UsageError(f"{path} holds no snapshot of a policy yet")
-    return found[-1]
+    return max(found, key=lambda snapshot: snapshot.stat().st_mtime_ns)
 
 
 def run_suite(
@@ -37,6 +34,7 @@ def run_suite(
 ) -> dict[str, float]:
     """Rates of the endings of a policy on a suite, with a progress bar on stderr."""
     from actor.evaluation import evaluate, rates
+    from common.policy_files import load_policy
 
     config = load_policy(policy)[0]
     tasks = suite_tasks(suite, config)

@@ -9,6 +9,7 @@ from typer.exceptions import TyperException
 
 from common.bus import NoAnswerError, RefusedError
 from common.errors import UsageError
+from common.messages import MessageError
 from deploy.cli import config, curriculum, doctor, evaluate, processes, train, world
 
 app = typer.Typer(
@@ -35,9 +36,11 @@ def run() -> None:
     except UsageError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)
-    except (NoAnswerError, RefusedError) as error:
+    except (NoAnswerError, RefusedError, MessageError) as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
     except TyperException as error:
         message = error.format_message()
         sys.stderr.write(f"error: {message or 'a command is missing; see navaclq --help'}\n")

@@ -55,11 +55,9 @@ def parse_cells(text: str) -> list[int]:
     cells: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
-        if not first.isdigit() or (dash and not last.isdigit()):
+        if not first.isdecimal() or (dash and not last.isdecimal()):
             raise UsageError(f"--cells {text!r} is no list of cells; write for example 0,3-5")
-        cells += range(int(first), int(last or first) + 1)
-    for cell in cells:
-        check_cell(cell)
+        cells += range(check_cell(int(first)), check_cell(int(last or first)) + 1)
     if not cells:
         raise UsageError(f"--cells {text!r} names no cell; write for example 0,3-5")
     return cells

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import math
-import os
+import re
 import signal
 import socket
 import subprocess
@@ -12,12 +13,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import IO, Annotated
 
 import typer
 
 from common.bus import open_client, open_hub
-from common.contract import accept_contract, fetch_contract
 from common.errors import UsageError
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
@@ -52,15 +52,20 @@ def learner(
         log.info("learner of run %r listens on %s", directory.name, address)
         try:
             service.run()
-        finally:
+        except SystemExit:
             service.close()
+            raise
+        # after any other exception the state is not to be trusted: the last checkpoint stays the newest
+        service.close()
 
 
 def actor(
     connect: options.Connect = options.DEFAULT_ENDPOINT,
     count: Annotated[int, typer.Option(min=1, max=256, help="Actor processes to start on this host.")] = 1,
     cells: Annotated[str, typer.Option(help="Cells to drive in, for example 0,3-5.")] = "0-8",
-    name: Annotated[str | None, typer.Option(help="Name of the actor; default: host and process id.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the actor; default: the first free of HOST-0, HOST-1, ...")
+    ] = None,
     spool: Annotated[
         Path | None, typer.Option(help="Folder for undelivered episodes; default: under ~/.cache/navaclq.")
     ] = None,
@@ -70,24 +75,45 @@ def actor(
     """Run actors: simulation, policy, delivery. Everything else they need comes from the hub."""
     address = options.endpoint(connect, insecure)
     chosen = options.parse_cells(cells)
-    base = name or f"{socket.gethostname()}-{os.getpid()}"
     if count > 1:
-        _start_many(count, base)
+        _start_many(count, name)
         return
     from actor.service import ActorService
+    from common.contract import accept_contract, fetch_contract
 
     start_logging()
     exit_on_signals()
     with open_client(address, say_waiting(f"the hub at {address}")) as session:
         contract = fetch_contract(session, say_waiting("a learner at the hub"))
         resolved = accept_contract(contract, tuple(settings or ()))
-        folder = (spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run) / base
-        service = ActorService(session, contract, resolved, base, folder, chosen)
-        log.info("actor %s drives %d worlds for run %r", base, resolved.actor.worlds, contract.run)
+        spools = spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run
+        own, lock = claim_name(spools, name)
+        service = ActorService(session, contract, resolved, own, spools / own, chosen)
+        log.info("actor %s drives %d worlds for run %r", own, resolved.actor.worlds, contract.run)
         try:
             service.run()
         finally:
             service.close()
+            lock.close()
+
+
+def claim_name(spools: Path, wanted: str | None) -> tuple[str, IO[str]]:
+    """A name whose spool no other live actor of this host holds, with the lock on it.
+
+    Without a wanted one, the first free of HOST-0, HOST-1, ...: a new actor so finds what its predecessor
+    left undelivered. Raises UsageError when the wanted one is taken.
+    """
+    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())[:48]
+    for name in [wanted] if wanted else (f"{host}-{i}" for i in range(1000)):
+        (spools / name).mkdir(parents=True, exist_ok=True)
+        lock = (spools / name / "lock").open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        return name, lock
+    raise UsageError(f"an actor named {wanted!r} is already connected; choose another --name")
 
 
 def say_waiting(whom: str) -> Callable[[float], None]:
@@ -103,15 +129,16 @@ def say_waiting(whom: str) -> Callable[[float], None]:
     return say
 
 
-def _start_many(count: int, base: str) -> None:
+def _start_many(count: int, base: str | None) -> None:
     """Runs `count` actors as processes of their own and passes a signal on to them."""
     arguments = _without(sys.argv[1:], "--count", "--name")
     command = [sys.executable, "-m", "deploy.cli.main", *arguments]
-    children = [
-        subprocess.Popen([*command, "--name", f"{base}.{i}"], start_new_session=True) for i in range(count)
-    ]
     exit_on_signals()
+    children: list[subprocess.Popen[bytes]] = []
     try:
+        for i in range(count):
+            named = ["--name", f"{base}.{i}"] if base else []
+            children.append(subprocess.Popen([*command, *named], start_new_session=True))
         while any(child.poll() is None for child in children):
             time.sleep(0.2)
     finally:

@@ -14,7 +14,6 @@ import typer
 from common.bus import Keys, open_client
 from common.config import parse
 from common.errors import UsageError
-from common.policy_files import CONFIG
 from common.tasks import suite as suite_tasks
 from common.telemetry import exit_on_signals
 from deploy.cli import options
@@ -55,7 +54,7 @@ def train(
     asked = _arguments(preset, variant, config, settings, seed)
     exit_on_signals()
     load = _supervise(run, minutes or 40.0, count, f"tcp/127.0.0.1:{port or free_port()}", asked)
-    result = _summary(run, minutes or 40.0, load)
+    result = _summary(run, load)
     if evaluation is not None:
         result["eval"] = _compare(run, evaluation, result["seed"])
     (run / "result.json").write_text(json.dumps(result, indent=1), "utf-8")
@@ -75,16 +74,16 @@ def _arguments(
 
 def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[str]) -> float:
     """Runs the processes until the learner's time is over; returns the load average at the end."""
-    elapsed = [0.0]
+    clock = _Clock()
 
     def learner() -> list[str]:
-        left = max(0.01, minutes - elapsed[0] / 60)
+        left = max(0.01, minutes - clock.total / 60)
         return ["learner", "--run", str(run), "--listen", address, "--minutes", f"{left:.4f}", *asked]
 
     screen: Screen | None = None
     early: list[str] = []
     supervisor = Supervisor(lambda event: screen.say(event) if screen else early.append(event))
-    main = Child("learner", learner, run / "logs" / "learner.log")
+    main = Child("learner", learner, run / "logs" / "learner.log", may_finish=True)
     try:
         supervisor.add(main)
         while not (run / "run.json").exists():
@@ -108,7 +107,7 @@ def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[
             )
             while not main.finished:
                 supervisor.check()
-                elapsed[0] = max(elapsed[0], float(monitor.learner.get("elapsed_s", 0.0)))
+                clock.read(float(monitor.learner.get("elapsed_s", 0.0)))
                 screen.update(lambda: [(c.name, c.alive, c.restarts) for c in supervisor.children])
                 time.sleep(0.2)
         return os.getloadavg()[0]
@@ -118,15 +117,31 @@ def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[
         supervisor.stop()
 
 
-def _summary(run: Path, minutes: float, load: float) -> dict[str, Any]:
-    config = parse((run / CONFIG).read_text("utf-8"))
+class _Clock:
+    """Seconds of training over all lives of the learner, each of which counts from zero."""
+
+    def __init__(self) -> None:
+        self._before = self._life = 0.0
+
+    @property
+    def total(self) -> float:
+        return self._before + self._life
+
+    def read(self, life: float) -> None:
+        if life < self._life:
+            self._before += self._life
+        self._life = life
+
+
+def _summary(run: Path, load: float) -> dict[str, Any]:
+    config = parse((run / "config.toml").read_text("utf-8"))
     learned = json.loads((run / "summary.json").read_text("utf-8"))
     return {
         "run": run.resolve().name,
         "seed": config.seed,
         "preset": config.preset,
         "variant": config.variant,
-        "minutes": minutes,
+        "minutes": learned["minutes"],
         "env_steps": learned["env_steps"],
         "episodes": learned["episodes"],
         "updates": learned["updates"],
@@ -141,7 +156,7 @@ def _compare(run: Path, suite: str, seed: int) -> dict[str, Any]:
     policies = {"before": run / "snapshots" / "initial", "after": run / "snapshots" / "final"}
     if missing := [path for path in policies.values() if not path.exists()]:
         raise UsageError(f"{missing[0]} is missing: nothing to evaluate")
-    config = parse((run / CONFIG).read_text("utf-8"))
+    config = parse((run / "config.toml").read_text("utf-8"))
     found = {name: run_suite(path, suite, workers, True, seed, name) for name, path in policies.items()}
     return {"suite": suite, "episodes": len(suite_tasks(suite, config)), **found}
 
