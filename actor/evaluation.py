@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import signal
 from collections import Counter
@@ -105,3 +106,12 @@ def rates(endings: list[Ending]) -> dict[str, float]:
     """Share of each ending, in [0, 1]."""
     counts = Counter(endings)
     return {name: counts[name] / len(endings) for name in ENDINGS}
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """The 95% confidence interval of a rate (Wilson 1927), within [0, 1]."""
+    z = 1.959963984540054
+    rate, spread = successes / trials, z**2 / trials
+    middle = (rate + spread / 2) / (1 + spread)
+    half = z * math.sqrt(rate * (1 - rate) / trials + spread / trials / 4) / (1 + spread)
+    return max(0.0, middle - half), min(1.0, middle + half)

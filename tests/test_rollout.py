@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from actor.evaluation import Examiner, evaluate, rates
+from actor.evaluation import Examiner, evaluate, rates, wilson_interval
 from actor.inference import Eyes, PolicyActor
 from actor.rollout import Rollout
 from common.config import resolve
@@ -141,3 +141,10 @@ def test_evaluation_refuses_networks_that_do_not_fit_their_configuration(tmp_pat
     other = resolve("smoke", overrides=("network.hidden=[16,16]",))
     with pytest.raises(UsageError, match="holds other networks than its configuration says"):
         evaluate(save(SMOKE, tmp_path / "policy", networks(other)), suite("short", SMOKE)[:1], processes=1)
+
+
+def test_wilson_interval_agrees_with_published_values():
+    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)  # Newcombe 1998, table I
+    assert wilson_interval(15, 148) == pytest.approx((0.0624, 0.1605), abs=1e-4)
+    assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert wilson_interval(29, 29) == pytest.approx((0.8830, 1.0), abs=1e-4)

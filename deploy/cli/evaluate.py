@@ -61,15 +61,19 @@ def evaluate(
     as_json: options.Json = False,
 ) -> None:
     """Drive a policy through a fixed suite of seeded tasks and count how the episodes end."""
+    from actor.evaluation import wilson_interval
+
     suite_tasks(suite, resolve())
     folder = find_policy(policy)
     workers = processes or os.cpu_count() or 1
     found = run_suite(folder, suite, workers, not sampled, seed, str(folder))
     size = len(suite_tasks(suite, resolve()))
+    low, high = wilson_interval(round(found["success"] * size), size)
     result: dict[str, Any] = {"policy": str(folder), "suite": suite, "seed": seed, "episodes": size}
-    result |= {"sampled": sampled, "all": found}
+    result |= {"sampled": sampled, "all": {**found, "ci95": [low, high]}}
     if as_json:
         options.print_json(result)
     else:
         text = ", ".join(f"{name.replace('_', ' ')} {100 * rate:.1f}%" for name, rate in found.items())
-        sys.stdout.write(f"{folder} on suite {suite} ({size} episodes): {text}\n")
+        interval = f"95% interval of success {100 * low:.1f} to {100 * high:.1f}%"
+        sys.stdout.write(f"{folder} on suite {suite} ({size} episodes): {text}; {interval}\n")
