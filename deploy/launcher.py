@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import logging
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from common.errors import UsageError
 
-log = logging.getLogger("navaclq")
 STOP_SECONDS = 4.0
 LONGEST_BACK_OFF = 30.0
 
@@ -42,7 +39,6 @@ class Child:
     next_start: float = 0.0
     started: float = 0.0
     back_off: float = 0.5
-    output: IO[bytes] | None = field(default=None, repr=False)
 
     @property
     def alive(self) -> bool:

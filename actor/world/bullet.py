@@ -1,4 +1,4 @@
-"""Pybullet without its chatter: it prints from C to stdout, which belongs to programs that read `--json`."""
+"""Pybullet without its chatter: it prints from C, also to stdout, which belongs to readers of `--json`."""
 
 from __future__ import annotations
 
@@ -10,30 +10,34 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def _silent_stdout() -> Iterator[None]:
-    """Sends file descriptor 1 to nowhere for a while, C's own buffer included."""
+def _silence() -> Iterator[None]:
+    """Sends file descriptors 1 and 2 to nowhere for a while, C's own buffers included."""
     libc = ctypes.CDLL(None)
     sys.stdout.flush()
+    sys.stderr.flush()
     libc.fflush(None)
-    saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
+    saved, nowhere = [os.dup(fd) for fd in (1, 2)], os.open(os.devnull, os.O_WRONLY)
+    for fd in (1, 2):
+        os.dup2(nowhere, fd)
     try:
         yield
     finally:
+        sys.stderr.flush()
         libc.fflush(None)
-        os.dup2(saved, 1)
-        os.close(saved)
+        for fd, copy in zip((1, 2), saved, strict=True):
+            os.dup2(copy, fd)
+            os.close(copy)
         os.close(nowhere)
 
 
-with _silent_stdout():
+with _silence():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient as BulletClient
 
 
 def connect() -> BulletClient:
     """A new physics server in this process, without a window."""
-    with _silent_stdout():
+    with _silence():
         return BulletClient(pybullet.DIRECT)
 
 
