@@ -111,7 +111,7 @@ class LearnerService:
         self._log = EpisodeLog(run.folder / "log", config.replay.capacity)
         self.progress = Progress()
         self._restore()
-        self._inbox: queue.SimpleQueue[tuple[Episode, int]] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[Episode] = queue.SimpleQueue()
         self._blobs: dict[str, bytes] = {}
         self._blobs_lock = threading.Lock()
         self._publish()
@@ -221,13 +221,13 @@ class LearnerService:
         episode = decode(Episode, payload)
         check_digest(self.contract.digest, episode.digest)
         episode.check_layout(self.layout, self.config.world.max_episode_steps)
-        record = self._log.append(origin, episode.length, payload)
-        self._inbox.put((episode, record.env_steps))
+        self._log.append(origin, episode.length, payload)
+        self._inbox.put(episode)
         return encode(Acknowledgement())
 
     def _ingest(self) -> None:
         while not self._inbox.empty():
-            episode, _ = self._inbox.get()
+            episode = self._inbox.get()
             if self._began is None:
                 self._began = time.monotonic() - episode.length * self.config.world.control_period
             self._store(episode)
@@ -255,8 +255,8 @@ class LearnerService:
             config.sac.batch_size, config.sac.n_step, config.sac.gamma, start + done * (end - start)
         )
         losses, errors = self.sac.update(batch)
-        if not math.isfinite(losses.critic):
-            raise ArithmeticError(f"the critic's loss is {losses.critic} at update {self.sac.updates}")
+        if not (math.isfinite(losses.critic) and math.isfinite(losses.alpha)):
+            raise ArithmeticError(f"losses are not finite at update {self.sac.updates}: {losses}")
         self.replay.update_priorities(batch, errors)
         self.progress.losses.append(losses)
 

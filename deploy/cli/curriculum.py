@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import Keys, ask, open_client, open_hub
+from common.bus import Keys, ask, check_endpoint, open_client, open_hub
 from common.errors import UsageError
 from common.messages import Proposals, TaskQuery
 from common.tasks import check_cell
@@ -60,14 +60,12 @@ def serve_curriculum(
     start_logging()
     exit_on_signals()
     if connect:
-        with open_client(
-            options.endpoint(connect, insecure), say_waiting(f"the hub at {connect}")
-        ) as session:
+        with open_client(check_endpoint(connect, insecure), say_waiting(f"the hub at {connect}")) as session:
             contract = fetch_contract(session, say_waiting("a learner at the hub"))
             resolved = accept_contract(contract, tuple(settings or ()))
             _serve(CurriculumService(session, contract.run, resolved, contract.digest, folder), connect)
     else:
-        address = options.endpoint(listen or options.DEFAULT_ENDPOINT, insecure)
+        address = check_endpoint(listen or options.DEFAULT_ENDPOINT, insecure)
         if run is not None and config is None and (run / "config.toml").exists():
             config = run / "config.toml"
         resolved = options.configuration(preset, variant, config, settings, seed)
@@ -96,7 +94,7 @@ def query(
 ) -> None:
     """Ask a running curriculum for tasks."""
     check_cell(cell)
-    with open_client(options.endpoint(connect, insecure), patience=timeout) as session:
+    with open_client(check_endpoint(connect, insecure), patience=timeout) as session:
         question = TaskQuery(cell=cell, t=t, count=count)
         answer = ask(session, Keys("*").task, question, Proposals, timeout, patience=timeout)
     if as_json:

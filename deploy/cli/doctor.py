@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from common.bus import NoAnswerError, RefusedError, open_client
+from common.bus import NoAnswerError, RefusedError, check_endpoint, open_client
 from common.messages import SCHEMA_VERSION, MessageError
 from deploy.cli import options
 
@@ -25,7 +25,7 @@ def doctor(
     as_json: options.Json = False,
 ) -> None:
     """Check versions, cores, pybullet's numpy support, torch's threads, free disk, and a named hub."""
-    address = options.endpoint(connect or options.DEFAULT_ENDPOINT, insecure)
+    address = check_endpoint(connect or options.DEFAULT_ENDPOINT, insecure)
     found = examine()
     found["hub"] = _ask_hub(address)
     if as_json:

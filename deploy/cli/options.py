@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from common.bus import check_endpoint
 from common.config import Config, resolve
 from common.errors import UsageError
 from common.tasks import check_cell
@@ -43,11 +42,6 @@ def configuration(
 ) -> Config:
     """The configuration that the common options ask for."""
     return resolve(preset, file, tuple(settings or ()), variant, seed)
-
-
-def endpoint(text: str, insecure: bool) -> str:
-    """A checked endpoint."""
-    return check_endpoint(text, insecure)
 
 
 def parse_cells(text: str) -> list[int]:

@@ -17,7 +17,7 @@ from typing import IO, Annotated
 
 import typer
 
-from common.bus import open_client, open_hub
+from common.bus import check_endpoint, open_client, open_hub
 from common.errors import UsageError
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
@@ -40,7 +40,7 @@ def learner(
     from learner.checkpoint import RunDirectory
     from learner.service import LearnerService
 
-    address = options.endpoint(listen, insecure)
+    address = check_endpoint(listen, insecure)
     wanted = None
     if not (run / "run.json").exists() or any((preset, variant, config, settings, seed is not None)):
         wanted = options.configuration(preset, variant, config, settings, seed)
@@ -73,7 +73,7 @@ def actor(
     insecure: options.Insecure = False,
 ) -> None:
     """Run actors: simulation, policy, delivery. Everything else they need comes from the hub."""
-    address = options.endpoint(connect, insecure)
+    address = check_endpoint(connect, insecure)
     chosen = options.parse_cells(cells)
     if count > 1:
         _start_many(count, name)
