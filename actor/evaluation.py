@@ -7,52 +7,68 @@ import multiprocessing
 import signal
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from actor.inference import Eyes, PolicyActor
+from actor.baseline.scripted import ScriptedActor
+from actor.inference import Actor, Eyes, PolicyActor
 from actor.rollout import Rollout
+from common.cells import CELLS
 from common.config import Config
 from common.errors import UsageError
 from common.messages import ENDINGS, Ending, Version
-from common.networks import Encoder, load_state, make_encoder
+from common.networks import load_state, make_encoder
 from common.policy_files import load_policy
-from common.tasks import CELLS, Task
+from common.tasks import Task
 
 CHUNK = 10
 """Tasks that a worker takes at a time."""
 SLOTS = len(CELLS)
 
 
-def load_actor(policy: Path, greedy: bool) -> tuple[Config, Encoder, PolicyActor]:
-    """What drives a policy from disk; raises UsageError when it is none, or damaged."""
-    config, tensors = load_policy(policy)
-    encoder = make_encoder(config)
-    actor = PolicyActor(config, SLOTS, np.random.default_rng(0), greedy)
+@dataclass(frozen=True, slots=True)
+class Scripted:
+    """Stands for a policy: the scripted controller with true poses (B0), in the world of `config`."""
+
+    config: Config
+
+
+def load_driver(policy: Path | Scripted, greedy: bool, slots: int, max_steps: int) -> tuple[Rollout, Actor]:
+    """Worlds and what drives in them; raises UsageError when `policy` is no policy, or damaged.
+
+    `max_steps` 0 stands for the configured length of an evaluation.
+    """
+    config, tensors = (policy.config, {}) if isinstance(policy, Scripted) else load_policy(policy)
+    encoder, limit = make_encoder(config), max_steps or config.world.max_evaluation_steps
+    if isinstance(policy, Scripted):
+        rollout = Rollout(config, Eyes(config, encoder), slots, limit)
+        return rollout, ScriptedActor(rollout.worlds)
+    actor = PolicyActor(config, slots, np.random.default_rng(0), greedy)
     try:
         if not config.encoder.end_to_end:
             load_state(tensors, encoder=encoder)
         actor.load(Version(counter=1), tensors)
     except ValueError as error:
         raise UsageError(f"{policy} holds other networks than its configuration says: {error}") from None
-    for slot in range(SLOTS):
+    for slot in range(slots):
         actor.refresh(slot)
-    return config, encoder, actor
+    return Rollout(config, Eyes(config, encoder), slots, limit), actor
 
 
 class Examiner:
     """Drives one policy through tasks, side by side in as many worlds as there are cells."""
 
-    def __init__(self, policy: Path, greedy: bool) -> None:
+    def __init__(self, policy: Path | Scripted, greedy: bool, max_steps: int = 0) -> None:
         torch.set_num_threads(1)
-        config, encoder, self._actor = load_actor(policy, greedy)
-        self._rollout = Rollout(config, Eyes(config, encoder), SLOTS, config.world.max_evaluation_steps)
+        self._rollout, self._actor = load_driver(policy, greedy, SLOTS, max_steps)
 
     def run(self, tasks: list[Task], rng: np.random.Generator) -> list[Ending]:
         """How each task ended, in the tasks' order; `rng` draws the actions unless they are greedy."""
-        self._actor.rng = rng
+        if isinstance(self._actor, PolicyActor):
+            self._actor.rng = rng
         waiting = list(enumerate(tasks))[::-1]
         running: dict[int, int] = {}
         endings: dict[int, Ending] = {}
@@ -69,10 +85,10 @@ class Examiner:
 _examiner: Examiner | None = None
 
 
-def _start_worker(policy: Path, greedy: bool) -> None:
+def _start_worker(policy: Path | Scripted, greedy: bool, max_steps: int) -> None:
     global _examiner
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    _examiner = Examiner(policy, greedy)
+    _examiner = Examiner(policy, greedy, max_steps)
 
 
 def _examine(work: tuple[int, list[Task], int]) -> tuple[int, list[Ending]]:
@@ -82,19 +98,23 @@ def _examine(work: tuple[int, list[Task], int]) -> tuple[int, list[Ending]]:
 
 
 def evaluate(
-    policy: Path,
+    policy: Path | Scripted,
     tasks: list[Task],
     processes: int,
     greedy: bool = True,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
+    max_steps: int = 0,
 ) -> list[Ending]:
-    """How each task ended, in order; `progress` hears the number done. Raises UsageError for a bad policy."""
-    load_actor(policy, greedy)  # a bad one is refused here, not in a worker
+    """How each task ended, in order; `progress` hears the number done. Raises UsageError for a bad policy.
+
+    `max_steps` 0 stands for the configured length of an evaluation.
+    """
+    load_driver(policy, greedy, 0, max_steps)  # a bad one is refused here, not in a worker
     chunks = [(i, tasks[i : i + CHUNK], seed) for i in range(0, len(tasks), CHUNK)]
     endings: dict[int, list[Ending]] = {}
     context = multiprocessing.get_context("spawn")
-    with context.Pool(processes, _start_worker, (policy, greedy)) as pool:
+    with context.Pool(processes, _start_worker, (policy, greedy, max_steps)) as pool:
         for index, found in pool.imap_unordered(_examine, chunks):
             endings[index] = found
             if progress:

@@ -11,7 +11,7 @@ from actor.inference import Actor, Eyes
 from actor.world.world import DockingWorld, Sensed
 from common.config import Config
 from common.messages import Candidate, Ending
-from common.observation import HISTORY, Columns, ObservationLayout, observe
+from common.observation import ACTION_SIZE, HISTORY, Columns, ObservationLayout, observe
 from common.tasks import Task
 
 
@@ -38,14 +38,14 @@ class Rollout:
         self.steps = 0
         """Environment steps of all worlds so far."""
         self._eyes = eyes
-        self._worlds = [DockingWorld(config.world, max_steps) for _ in range(slots)]
+        self.worlds = [DockingWorld(config.world, max_steps) for _ in range(slots)]
         self._rows = max_steps + 1
         self._columns = Columns.empty(slots * self._rows, self.layout)
         self._recent: list[list[NDArray[np.uint8]]] = [[] for _ in range(slots)]
         self._running: list[Task | None] = [None] * slots
 
     def __len__(self) -> int:
-        return len(self._worlds)
+        return len(self.worlds)
 
     @property
     def idle(self) -> list[int]:
@@ -55,13 +55,22 @@ class Rollout:
     def reset(self, slot: int, task: Task) -> None:
         """Starts an episode; raises UsageError for an impossible task."""
         self._recent[slot].clear()
-        self._put([slot], [self._worlds[slot].reset(task)])
+        self._put([slot], [self.worlds[slot].reset(task)])
         self._running[slot] = task
 
     def look(self, slot: int, task: Task) -> Candidate:
         """Renders and encodes a start in an idle slot without driving it."""
-        sensed = self._worlds[slot].reset(task)
+        sensed = self.worlds[slot].reset(task)
         return Candidate(task=task, visual=self._eyes.see([[sensed.frame]])[0], lidar=sensed.lidar)
+
+    def newest(self, slot: int) -> tuple[Sensed, NDArray[np.float32], float]:
+        """What a world sensed last, and the action and reward that led there (zeros at a start)."""
+        steps = self.worlds[slot].steps
+        row = slot * self._rows + steps
+        sensed = Sensed(self._recent[slot][-1], self._columns.lidar[row])
+        if steps == 0:
+            return sensed, np.zeros(ACTION_SIZE, np.float32), 0.0
+        return sensed, self._columns.action[row - 1], float(self._columns.reward[row - 1])
 
     def step(self, actor: Actor) -> list[Finished]:
         """One control step of every running world; returns the episodes that it ended."""
@@ -69,9 +78,9 @@ class Rollout:
         if not slots:
             return []
         starts = np.array(slots) * self._rows
-        rows = starts + [self._worlds[slot].steps for slot in slots]
+        rows = starts + [self.worlds[slot].steps for slot in slots]
         actions = actor.act(observe(self._columns, rows, starts, self.layout), slots)
-        steps = [self._worlds[slot].step(action) for slot, action in zip(slots, actions, strict=True)]
+        steps = [self.worlds[slot].step(action) for slot, action in zip(slots, actions, strict=True)]
         self._columns.action[rows] = actions
         self._columns.reward[rows] = [step.reward for step in steps]
         self._put(slots, [step.sensed for step in steps])
@@ -82,7 +91,7 @@ class Rollout:
 
     def close(self) -> None:
         """Frees the physics clients."""
-        for world in self._worlds:
+        for world in self.worlds:
             world.close()
 
     def _put(self, slots: list[int], sensed: list[Sensed]) -> None:
@@ -91,14 +100,14 @@ class Rollout:
             self._recent[slot] = [*self._recent[slot], new.frame][-HISTORY:]
         visual = self._eyes.see([self._recent[slot] for slot in slots])
         for slot, new, seen in zip(slots, sensed, visual, strict=True):
-            row = slot * self._rows + self._worlds[slot].steps
+            row = slot * self._rows + self.worlds[slot].steps
             self._columns.visual[row], self._columns.lidar[row] = seen, new.lidar
 
     def _finish(self, slot: int, ending: Ending) -> Finished:
         task, self._running[slot] = self._running[slot], None
         assert task is not None
         first = slot * self._rows
-        last = first + self._worlds[slot].steps
+        last = first + self.worlds[slot].steps
         self._columns.action[last], self._columns.reward[last] = 0.0, 0.0
         columns = Columns(*(part[first : last + 1].copy() for part in self._columns.parts()))
         return Finished(slot, task, columns, ending)

@@ -14,154 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from common.errors import UsageError
+from common.settings import Count, Fraction, Positive, Section
+from common.world_config import StartRanges, WorldConfig
 
 Preset = Literal["paper", "fast", "smoke"]
 Variant = Literal["navacl-q", "rnd", "e2e"]
-Positive = Annotated[float, Field(gt=0)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Count = Annotated[int, Field(ge=1)]
-
-
-class Section(BaseModel):
-    """A group of settings: immutable, finite numbers, no unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
-
-
-class StartRanges(Section):
-    """Where an episode may start (appendix B, table of randomisation)."""
-
-    distance_min: Positive = 1.5
-    """Smallest centre-to-centre distance of robot and dolly, m; below 1.25 the robot starts half under it."""
-    distance_max: Positive = 5.0
-    """Largest one, m; uniform in between (the paper's RND histogram is flat)."""
-    yaw: Annotated[float, Field(ge=0, le=180)] = 90.0
-    """Robot yaw is uniform in +- this, degrees."""
-    bearing: Annotated[float, Field(ge=0, le=15)] = 15.0
-    """Half the central angle of the dolly's circle segment about the cell's +y, degrees."""
-    dolly_yaw: Annotated[float, Field(ge=0, le=15)] = 15.0
-    """Dolly yaw is uniform in +- this, degrees."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> StartRanges:
-        if not self.distance_min <= self.distance_max <= 5.0:
-            raise ValueError("distance_min <= distance_max <= 5 m must hold")
-        return self
-
-    def towards(self, other: StartRanges, share: float) -> StartRanges:
-        """Ranges between these and others: share 0 is these, 1 the others."""
-        values = {}
-        for key, ours in self.model_dump().items():
-            theirs = getattr(other, key)
-            between = (1 - share) * ours + share * theirs
-            values[key] = min(max(between, min(ours, theirs)), max(ours, theirs))  # rounding may leave them
-        return StartRanges(**values)
-
-
-class RobotConfig(Section):
-    """The vehicle (appendix C); drive limits decided."""
-
-    length: Positive = 1.273
-    width: Positive = 0.630
-    height: Positive = 0.300
-    """Top of the chassis above the floor, m."""
-    floor_gap: Positive = 0.030
-    max_speed: Positive = 1.2
-    """Largest speed of either wheel, m/s."""
-    track: Positive = 0.500
-    """Distance of the two driven wheels, m."""
-    wheel_acceleration: Positive = 3.0
-    """Largest change of a wheel's speed, m/s^2."""
-
-
-class DollyConfig(Section):
-    """The dolly (appendix C); heights, legs and rails decided."""
-
-    length: Positive = 1.230
-    width: Positive = 0.820
-    underside: Positive = 0.340
-    deck: Positive = 0.060
-    """Thickness of the deck, m."""
-    leg: Positive = 0.040
-    """Side of the square section of a leg and of a rail, m."""
-    rail_height: Positive = 0.100
-    """Centre line of the side rails above the floor, m."""
-
-
-class CameraConfig(Section):
-    """The front camera (table 1, appendix C)."""
-
-    size: Annotated[int, Field(ge=16, le=1024, multiple_of=16)] = 80
-    """Width and height, pixels."""
-    fov: Annotated[float, Field(gt=1, lt=170)] = 47.0
-    """Field of view, degrees."""
-    near: Positive = 0.02
-    far: Positive = 40.0
-
-
-class LidarConfig(Section):
-    """Two LiDARs on diagonal corners, front-left and rear-right (table 1, appendix C)."""
-
-    beams: Annotated[int, Field(ge=2, le=4096)] = 128
-    """Beams of each sensor."""
-    fov: Annotated[float, Field(gt=0, le=270)] = 225.0
-    """Degrees."""
-    range: Positive = 6.0
-    """Largest distance, m; readings are scaled by it to [0, 1]."""
-    height: Positive = 0.200
-
-
-class RewardConfig(Section):
-    """The reward's terms (section 3.3)."""
-
-    step: float = -0.1
-    slow: float = -0.05
-    slow_speed: float = 0.3
-    """Forward speed at the end of the step below which `slow` applies, m/s."""
-    dolly_contact: float = -0.1
-    other_contact: float = -10.0
-    success: float = 10.0
-    success_distance: Positive = 0.3
-    """Distance of the centres that counts as docked, m."""
-
-
-class ObstacleConfig(Section):
-    """Obstacles left and right of the dolly (appendix B); sizes decided."""
-
-    count_min: Annotated[int, Field(ge=0)] = 1
-    count_max: Annotated[int, Field(ge=0, le=8)] = 4
-    distance_min: Positive = 2.0
-    distance_max: Positive = 5.0
-
-    @model_validator(mode="after")
-    def _ordered(self) -> ObstacleConfig:
-        if self.count_min > self.count_max or self.distance_min > self.distance_max:
-            raise ValueError("count_min <= count_max and distance_min <= distance_max must hold")
-        return self
-
-
-class WorldConfig(Section):
-    """The docking task, the same in every preset."""
-
-    control_period: Positive = 0.180
-    """Seconds for which an action is held (section 3.3)."""
-    substeps: Count = 36
-    """Physics steps per control period; contact and success are checked at each."""
-    max_episode_steps: Count = 100
-    """Training; a truncation, never a terminal (decided)."""
-    max_evaluation_steps: Count = 200
-    randomize_appearance: bool = True
-    """New textures, colours and light in every episode (section 3.3)."""
-    robot: RobotConfig = RobotConfig()
-    dolly: DollyConfig = DollyConfig()
-    camera: CameraConfig = CameraConfig()
-    lidar: LidarConfig = LidarConfig()
-    reward: RewardConfig = RewardConfig()
-    start: StartRanges = StartRanges()
-    obstacles: ObstacleConfig = ObstacleConfig()
 
 
 class EncoderConfig(Section):
@@ -367,7 +227,9 @@ def resolve(
     if variant not in get_args(Variant):
         raise UsageError(f"variant {variant!r} does not exist; choose one of {', '.join(VARIANTS)}")
     text = resources.files("common").joinpath("presets", f"{preset}.toml").read_text("utf-8")
-    merged = _merge(_merge(tomllib.loads(text), VARIANTS[variant]), values)
+    merged = Config().model_dump(mode="json")  # or a part of a section would bring back its class's defaults
+    for layer in (tomllib.loads(text), VARIANTS[variant], values):
+        merged = _merge(merged, layer)
     merged |= {"preset": preset, "variant": variant}
     if seed is not None:
         merged["seed"] = seed

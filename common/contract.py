@@ -18,18 +18,18 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from common.bus import Keys, ask
+from common.cells import CELLS
 from common.config import Config, differing_key, override, parse
 from common.errors import UsageError
 from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
 from common.networks import Encoder, load_state, make_encoder, state_of
 from common.observation import HISTORY
-from common.tasks import CELLS
 
-WORLD_VERSION = 1
+WORLD_VERSION = 2
 """To be counted up by whoever changes how a scene is drawn, how the robot drives or what ends an episode."""
 
 AGREED = {
-    "observation": ("world.camera", "world.lidar", "encoder"),
+    "observation": ("world.camera", "world.lidar", "world.randomization", "encoder"),
     "dynamics": ("world.robot", "world.dolly", "world.obstacles", "world.control_period", "world.substeps"),
     "reward": ("world.reward", "world.max_episode_steps"),
 }

@@ -8,6 +8,7 @@ same: x to its right, y forward.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,3 +96,45 @@ def rectangles_overlap(a: Rectangle, b: Rectangle, margin: float = 0.0) -> bool:
         if qa.max() < qb.min() or qb.max() < qa.min():
             return False
     return True
+
+
+def separations(poses: Array, half: tuple[float, float], rectangles: Array) -> Array:
+    """Largest gap along a separating axis (m) between N rectangles of one size and M others, (N, M).
+
+    `poses` (N, 3) are x, y, yaw of the first, `half` their half extents; `rectangles` (M, 5) rows of x, y,
+    yaw, half_x, half_y. Negative exactly when two overlap, then minus the depth; positive, it never exceeds
+    their distance.
+    """
+    x, y, yaw = (poses[:, None, k] for k in range(3))
+    rx, ry, ryaw, rhx, rhy = (rectangles[None, :, k] for k in range(5))
+    c, s = np.abs(np.cos(yaw - ryaw)), np.abs(np.sin(yaw - ryaw))
+    dx, dy = rx - x, ry - y
+
+    def along(angle: Array) -> tuple[Array, Array]:
+        return np.abs(np.cos(angle) * dx + np.sin(angle) * dy), np.abs(
+            np.cos(angle) * dy - np.sin(angle) * dx
+        )
+
+    own, theirs = along(yaw), along(ryaw)
+    gaps = (
+        own[0] - half[0] - (c * rhx + s * rhy),
+        own[1] - half[1] - (s * rhx + c * rhy),
+        theirs[0] - rhx - (c * half[0] + s * half[1]),
+        theirs[1] - rhy - (s * half[0] + c * half[1]),
+    )
+    return np.asarray(np.maximum.reduce(gaps))
+
+
+def as_rows(rectangles: Iterable[Rectangle]) -> Array:
+    """(M, 5) rows of x, y, yaw, half_x, half_y."""
+    rows = [(r.pose.x, r.pose.y, r.pose.yaw, r.half_x, r.half_y) for r in rectangles]
+    return np.array(rows, np.float64).reshape(-1, 5)
+
+
+def inside_polygon(x: float, y: float, corners: Sequence[tuple[float, float]]) -> bool:
+    """Whether a point lies inside a simple polygon: a ray to +x crosses its edges an odd number of times."""
+    inside = False
+    for (x0, y0), (x1, y1) in zip(corners, (*corners[1:], corners[0]), strict=True):
+        if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
+            inside = not inside
+    return inside

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
 
+from common.cells import CELLS
 from common.observation import ACTION_SIZE, Columns, ObservationLayout
-from common.tasks import CELLS, GeometricProperties, Task
+from common.tasks import GeometricProperties, TrainingTask
 
 SCHEMA_VERSION = 1
 MEGABYTE = 2**20
@@ -100,7 +101,7 @@ class Episode(Message):
     max_bytes: ClassVar[int] = 64 * MEGABYTE
 
     digest: Digest
-    task: Task
+    task: TrainingTask
     visual: WireArray
     lidar: WireArray
     action: WireArray
@@ -157,7 +158,7 @@ class Proposal(Message):
     """One proposed task with everything that led to it."""
 
     id: Name
-    task: Task
+    task: TrainingTask
     requested: Requested
     category: Annotated[str, Field(max_length=32)]
     """What was found: the requested type, `random` when n_T draws met nothing, `gate`, `rnd`."""
@@ -182,7 +183,7 @@ class Outcome(Message):
 
     digest: Digest
     proposal: Name
-    task: Task
+    task: TrainingTask
     properties: GeometricProperties
     q: float | None
     success: bool
@@ -192,7 +193,7 @@ class Outcome(Message):
 class Candidate(Message):
     """A start that an actor has rendered and encoded: one observation row, stacked by replication."""
 
-    task: Task
+    task: TrainingTask
     visual: WireArray
     lidar: WireArray
 

@@ -1,85 +1,76 @@
-"""Cells, tasks and the scenes they stand for: everything about a start that needs no simulator.
+"""Tasks and the scenes they stand for: everything about a start that needs no simulator.
 
-A `Task` (cell, seed, start ranges) rebuilds its `Scene` exactly, on any host; the curriculum reads a task's
+A `Task` (cell, seed, start) rebuilds its `Scene` exactly, on any host; the curriculum reads a task's
 geometric properties from it without pybullet, the simulator builds the same scene in it.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from common.config import Config, Section, StartRanges, WorldConfig
+from common.cells import CELLS, ROOMS, Box, Cell, Kind, arena_index
+from common.config import Config
 from common.errors import UsageError
 from common.geometry import SE2, Rectangle, bearing, distance_to_rectangle, rectangles_overlap, wrap
+from common.settings import Section
+from common.world_config import ObstacleConfig, StartRanges, WorldConfig
 
-START_JITTER = 0.5
-"""Robot start, +- m around the cell's start point in x and y (appendix B)."""
 START_MARGIN = 0.02
 """Free space around a starting robot, m (decided)."""
+CORRIDOR_MARGIN = 0.10
+"""Free space on either side of the robot on its way under the dolly, m (decided)."""
+CATALOGUE_SIZE = 12
+"""Boxes that obstacles are taken from."""
+GRID_HEADINGS = (0, -45, 45, -90, 90, -135, 135, 180)
+"""Degrees (section 4.2)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
-    """An upright box standing on the floor."""
+class PlacedStart(Section):
+    """A start at one pose, the dolly at its place in the room: the grid test's (section 4.2)."""
 
-    footprint: Rectangle
-    height: float
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """A room in the frame of its start point (0, 0): inner faces of its walls and what stands in it (m)."""
-
-    left: float
-    right: float
-    back: float
-    front: float
-    fixtures: tuple[Box, ...] = ()
-    wall_height: float = 3.0
-
-    def walls(self) -> tuple[Box, ...]:
-        """The four walls as boxes, 0.2 m thick, outside the inner faces."""
-        t = 0.1
-        mid_x, mid_y = (self.left + self.right) / 2, (self.back + self.front) / 2
-        half_x, half_y = (self.right - self.left) / 2, (self.front - self.back) / 2
-        placed = (
-            (self.left - t, mid_y, t, half_y + 2 * t),
-            (self.right + t, mid_y, t, half_y + 2 * t),
-            (mid_x, self.back - t, half_x, t),
-            (mid_x, self.front + t, half_x, t),
-        )
-        return tuple(_box(x, y, hx, hy, self.wall_height) for x, y, hx, hy in placed)
+    x: Annotated[float, Field(ge=-20, le=20)]
+    """Robot's centre in the dolly's frame, m: x to the dolly's right, y ahead, so y < 0 is in front of it."""
+    y: Annotated[float, Field(ge=-20, le=20)]
+    yaw: Annotated[float, Field(ge=-180, le=180)]
+    """Degrees; 0 faces as the dolly does."""
 
 
-def _box(x: float, y: float, half_x: float, half_y: float, height: float, yaw: float = 0.0) -> Box:
-    return Box(Rectangle(SE2(x, y, yaw), half_x, half_y), height)
+class DollyShift(Section):
+    """The dolly moves in mid-episode, at once (the paper's demonstration of adaptability)."""
 
-
-CELLS: tuple[Cell, ...] = (
-    Cell(-5.5, 5.5, -2.5, 9.0),
-    Cell(-4.5, 7.0, -2.0, 8.0, (_box(6.4, 3.0, 0.5, 2.5, 2.2),)),
-    Cell(-7.0, 4.8, -3.0, 10.0, (_box(-4.2, 2.0, 0.2, 0.2, 3.0), _box(-4.2, 6.5, 0.2, 0.2, 3.0))),
-    Cell(-6.0, 6.0, -2.2, 7.5, (_box(-5.4, 5.6, 0.6, 1.6, 1.6),)),
-    Cell(-5.0, 5.0, -4.0, 11.0, (_box(3.6, -2.6, 0.6, 0.4, 1.1), _box(-3.8, -2.8, 0.4, 0.6, 0.8))),
-    Cell(-8.0, 8.0, -2.5, 8.5, (_box(7.3, 0.0, 0.5, 1.8, 2.0), _box(-7.3, 4.0, 0.5, 2.4, 2.0))),
-    Cell(-4.6, 4.6, -2.0, 12.0, (_box(0.0, 11.2, 2.0, 0.5, 2.4),)),
-    Cell(-6.5, 5.2, -3.5, 9.5, (_box(-5.0, -2.8, 1.2, 0.5, 1.2), _box(4.6, 7.5, 0.4, 1.5, 1.8))),
-    Cell(-7.5, 6.0, -2.8, 7.2, (_box(5.2, 6.4, 0.6, 0.6, 1.0), _box(-6.9, -2.2, 0.4, 0.4, 1.4))),
-)
-"""The nine training cells (section 3.3); sizes and fixtures decided."""
+    step: Annotated[int, Field(ge=1, le=10_000)]
+    """Control steps before it moves; it waits while the robot stands in its new place."""
+    x: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """Displacement in the dolly's first frame, m."""
+    y: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    yaw: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """Degrees."""
 
 
 class Task(Section):
-    """One episode's start: `seed` fixes geometry, textures and light within the ranges."""
+    """One episode's start: `seed` fixes geometry, textures, light and noise within the ranges."""
 
-    cell: Annotated[int, Field(ge=0, lt=len(CELLS))]
+    cell: Annotated[int, Field(ge=0, lt=len(ROOMS))]
     seed: Annotated[int, Field(ge=0, lt=2**53)]
-    start: StartRanges
+    start: StartRanges | PlacedStart
+    shift: DollyShift | None = None
+
+
+def _in_training_cell(task: Task) -> Task:
+    if task.cell >= len(CELLS):
+        raise ValueError(f"cell {task.cell} is an arena, where nothing is trained")
+    return task
+
+
+TrainingTask = Annotated[Task, AfterValidator(_in_training_cell)]
+"""What learner and curriculum accept."""
 
 
 class GeometricProperties(Section):
@@ -100,56 +91,118 @@ class GeometricProperties(Section):
 
 
 @dataclass(frozen=True, slots=True)
+class Obstacle:
+    """A box of the catalogue (its index there) at a pose."""
+
+    index: int
+    box: Box
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """A task's geometry: poses of robot and dolly in the cell's frame, and the obstacles."""
 
     robot: SE2
     dolly: SE2
-    obstacles: tuple[Box, ...]
-
-
-def check_cell(cell: int) -> int:
-    """The cell itself; raises UsageError when there is none of that number."""
-    if not 0 <= cell < len(CELLS):
-        raise UsageError(f"cell {cell} does not exist; cells are 0 to {len(CELLS) - 1}")
-    return cell
+    obstacles: tuple[Obstacle, ...]
+    shifted: SE2 | None = None
+    """Where the dolly moves in mid-episode."""
 
 
 def random_stream(task: Task, purpose: int) -> np.random.Generator:
-    """The task's own random numbers for one purpose (0 geometry, 1 appearance)."""
+    """The task's own random numbers for one purpose (0 geometry, 1 appearance, 2 sensor noise)."""
     return np.random.default_rng([task.seed, task.cell, purpose])
 
 
+@lru_cache(maxsize=16)
+def obstacle_catalogue(config: ObstacleConfig) -> tuple[tuple[float, float, float, Kind], ...]:
+    """The boxes (half width, half depth, height, kind) whose sizes fill the ranges of `config`.
+
+    A scene uses each at most once, so that a simulator can make them all once and move them about.
+    """
+    kinds: tuple[Kind, ...] = ("crate", "pallet", "machine")
+
+    def spread(low_high: tuple[float, float], index: int) -> float:
+        low, high = low_high
+        return low + (high - low) * (index % CATALOGUE_SIZE + 0.5) / CATALOGUE_SIZE
+
+    return tuple(
+        (  # each size once, hardly correlated
+            spread(config.size, i) / 2,
+            spread(config.size, i + 2) / 2,
+            spread(config.height, 5 * i + 1),
+            kinds[i % len(kinds)],
+        )
+        for i in range(CATALOGUE_SIZE)
+    )
+
+
 def build_scene(task: Task, world: WorldConfig) -> Scene:
-    """The scene of a task (appendix B); the same arguments give the same scene to the bit."""
-    rng = random_stream(task, 0)
-    start, cell = task.start, CELLS[task.cell]
-    for _ in range(1000):
+    """The scene of a task (appendix B); the same arguments give the same scene to the bit.
+
+    Raises UsageError with the commonest reason when no draw fits.
+    """
+    rng, reasons, draws = random_stream(task, 0), Counter[str](), 200
+    distance = 0.0
+    if isinstance(task.start, StartRanges):  # drawn once, so that distances stay uniform whatever fits
+        distance = rng.uniform(task.start.distance_min, task.start.distance_max)
+    for _ in range(draws):
+        scene = _draw_scene(task, world, distance, rng)
+        if isinstance(scene, Scene):
+            return scene
+        reasons[scene] += 1
+    reason, count = reasons.most_common(1)[0]
+    place = f"cell {task.cell} ({ROOMS[task.cell].name})"
+    if isinstance(task.start, StartRanges):
+        place += f" at a distance of {distance:.2f} m"
+    raise UsageError(f"no free start in {place}: {reason} in {count} of {draws} draws")
+
+
+def _draw_scene(task: Task, world: WorldConfig, distance: float, rng: np.random.Generator) -> Scene | str:
+    """One draw: a scene, or the reason why it does not fit."""
+    start, cell = task.start, ROOMS[task.cell]
+    if isinstance(start, PlacedStart):
+        dolly = cell.dolly
+        robot = dolly @ SE2(start.x, start.y, math.radians(start.yaw))
+    else:
         robot = SE2(
-            rng.uniform(-START_JITTER, START_JITTER),
-            rng.uniform(-START_JITTER, START_JITTER),
+            rng.uniform(-start.jitter, start.jitter),
+            rng.uniform(-start.jitter, start.jitter),
             math.radians(rng.uniform(-start.yaw, start.yaw)),
         )
-        distance = rng.uniform(start.distance_min, start.distance_max)
         angle = math.radians(rng.uniform(-start.bearing, start.bearing))
         dolly = SE2(
             robot.x - distance * math.sin(angle),
             robot.y + distance * math.cos(angle),
             math.radians(rng.uniform(-start.dolly_yaw, start.dolly_yaw)),
         )
-        body = Rectangle(robot, world.robot.width / 2, world.robot.length / 2)
-        target = Rectangle(dolly, world.dolly.width / 2, world.dolly.length / 2)
-        solid = [box.footprint for box in cell.walls() + cell.fixtures]
-        if any(rectangles_overlap(body, side, START_MARGIN) for side in dolly_sides(dolly, world)):
+    body = Rectangle(robot, world.robot.width / 2, world.robot.length / 2)
+    if any(rectangles_overlap(body, side, START_MARGIN) for side in dolly_sides(dolly, world)):
+        return "the robot touches the dolly"
+    if not cell.contains(robot.x, robot.y) or _hits(body, cell.solids, START_MARGIN):
+        return "the robot stands in a wall or fixture"
+    keep_free = [body]
+    shifted = None
+    if task.shift is not None:
+        shifted = dolly @ SE2(task.shift.x, task.shift.y, math.radians(task.shift.yaw))
+    for place, who in ((dolly, "dolly"), (shifted, "shifted dolly")):
+        if place is None:
             continue
-        if any(rectangles_overlap(shape, r, START_MARGIN) for shape in (body, target) for r in solid):
-            continue
-        obstacles = _place_obstacles(rng, world, [body, target], solid, dolly)
-        if obstacles is not None:
-            return Scene(robot, dolly, obstacles)
-    raise UsageError(
-        f"no free start in cell {task.cell} for distances {start.distance_min} to {start.distance_max} m"
-    )
+        target = Rectangle(place, world.dolly.width / 2, world.dolly.length / 2)
+        corridor = docking_corridor(place, robot, world)
+        if not cell.contains(place.x, place.y) or _hits(target, cell.solids, START_MARGIN):
+            return f"the {who} stands in a wall or fixture"
+        if _hits(corridor, cell.solids):
+            return f"the {who} has no free docking corridor"
+        keep_free += [target, corridor]
+    obstacles = _place_obstacles(rng, world.obstacles, keep_free, cell, dolly)
+    if obstacles is None:
+        return "the room has no space for the obstacles"
+    return Scene(robot, dolly, obstacles, shifted)
+
+
+def _hits(shape: Rectangle, others: tuple[Rectangle, ...], margin: float = 0.0) -> bool:
+    return any(rectangles_overlap(shape, other, margin) for other in others)
 
 
 def dolly_sides(dolly: SE2, world: WorldConfig) -> tuple[Rectangle, Rectangle]:
@@ -163,43 +216,53 @@ def dolly_sides(dolly: SE2, world: WorldConfig) -> tuple[Rectangle, Rectangle]:
     )
 
 
+def docking_corridor(dolly: SE2, robot: SE2, world: WorldConfig) -> Rectangle:
+    """The strip before the dolly's short side on the robot's side that a docking robot passes through."""
+    length = world.robot.length + 2 * CORRIDOR_MARGIN
+    side = 1.0 if (dolly.inverse() @ robot).y > 0 else -1.0
+    middle = dolly @ SE2(0.0, side * (world.dolly.length + length) / 2)
+    return Rectangle(middle, world.robot.width / 2 + CORRIDOR_MARGIN, length / 2)
+
+
 def _place_obstacles(
-    rng: np.random.Generator, world: WorldConfig, movable: list[Rectangle], solid: list[Rectangle], dolly: SE2
-) -> tuple[Box, ...] | None:
+    rng: np.random.Generator, config: ObstacleConfig, keep_free: list[Rectangle], cell: Cell, dolly: SE2
+) -> tuple[Obstacle, ...] | None:
     """Boxes left and right of the dolly, clear of everything; None when the room has no space for them."""
-    config, boxes = world.obstacles, list[Box]()
-    for _ in range(int(rng.integers(config.count_min, config.count_max + 1))):
+    catalogue, placed = obstacle_catalogue(config), list[Obstacle]()
+    count = int(rng.integers(config.count_min, config.count_max + 1))
+    spread = math.radians(config.spread)
+    for index in rng.permutation(len(catalogue))[:count]:
+        half_x, half_y, height, kind = catalogue[index]
         for _ in range(50):
             away = rng.uniform(config.distance_min, config.distance_max)
-            side = rng.uniform(-0.5, 0.5) + (math.pi if rng.random() < 0.5 else 0.0)
-            shape = Rectangle(
-                SE2(
-                    dolly.x + away * math.cos(side), dolly.y + away * math.sin(side), rng.uniform(-3.14, 3.14)
-                ),
-                rng.uniform(0.15, 0.6),
-                rng.uniform(0.15, 0.6),
-            )
-            height = rng.uniform(0.4, 1.8)
-            taken = solid + [box.footprint for box in boxes]
-            clear = not any(rectangles_overlap(shape, r) for r in taken)
-            if clear and not any(rectangles_overlap(shape, r, 0.4) for r in movable):
-                boxes.append(Box(shape, height))
+            side = rng.uniform(-spread, spread) + (math.pi if rng.random() < 0.5 else 0.0)
+            x, y = dolly.x + away * math.cos(side), dolly.y + away * math.sin(side)
+            shape = Rectangle(SE2(x, y, rng.uniform(-math.pi, math.pi)), half_x, half_y)
+            taken = (*cell.solids, *(other.box.footprint for other in placed))
+            blocks_way = any(rectangles_overlap(shape, r, config.clearance) for r in keep_free)
+            if cell.contains(x, y) and not blocks_way and not _hits(shape, taken):
+                placed.append(Obstacle(int(index), Box(shape, height, kind)))
                 break
         else:
             return None
-    return tuple(boxes)
+    return tuple(placed)
+
+
+def surfaces(cell: int, scene: Scene) -> list[Rectangle]:
+    """Footprints of everything solid but the dolly."""
+    return [*ROOMS[cell].solids, *(obstacle.box.footprint for obstacle in scene.obstacles)]
 
 
 def geometric_properties(task: Task, scene: Scene) -> GeometricProperties:
     """Table 2 of the paper and the two properties of NavACL-Q+."""
-    cell, robot, dolly = CELLS[task.cell], scene.robot, scene.dolly
-    surfaces = [box.footprint for box in cell.walls() + cell.fixtures + scene.obstacles]
+    robot, dolly = scene.robot, scene.dolly
+    solid = surfaces(task.cell, scene)
     seen = dolly.inverse() @ robot
     line = SE2(robot.x, robot.y, dolly.yaw)
     return GeometricProperties(
         distance=math.hypot(dolly.x - robot.x, dolly.y - robot.y),
-        agent_clearance=min(distance_to_rectangle(robot.x, robot.y, r) for r in surfaces),
-        goal_clearance=min(distance_to_rectangle(dolly.x, dolly.y, r) for r in surfaces),
+        agent_clearance=min(distance_to_rectangle(robot.x, robot.y, r) for r in solid),
+        goal_clearance=min(distance_to_rectangle(dolly.x, dolly.y, r) for r in solid),
         relative_angle=abs(wrap(bearing(robot, dolly.x, dolly.y))),
         lateral_offset=abs(seen.x),
         approach_angle=abs(bearing(line, dolly.x, dolly.y)),
@@ -232,3 +295,21 @@ def suite(name: str, config: Config) -> list[Task]:
     if name == "train":
         return [Task(cell=i % len(CELLS), seed=2**41 + i, start=config.world.start) for i in range(400)]
     raise UsageError(f"suite {name!r} does not exist; choose one of {', '.join(SUITES)}")
+
+
+def grid(arena: str, repeats: int, seed: int = 0) -> list[Task]:
+    """The grid test (section 4.2): 11 x 11 starts, 8 headings, `repeats` that differ in all but the start.
+
+    968 tasks for each repeat. Raises UsageError for an unknown arena.
+    """
+    starts = [
+        PlacedStart(x=-2.5 + 0.5 * column, y=-1.5 - 0.5 * row, yaw=heading)
+        for heading in GRID_HEADINGS
+        for row in range(11)
+        for column in range(11)
+    ]
+    first = 2**42 + seed * 2**20
+    return [
+        Task(cell=arena_index(arena), seed=first + index, start=start)
+        for index, start in enumerate(starts * repeats)
+    ]

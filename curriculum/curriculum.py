@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from common.config import Config, StartRanges
+from common.config import Config
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
 from common.messages import Candidates, Outcome, Proposal, Requested
 from common.policy_files import load_tensors, save_folder
 from common.tasks import Task, candidate_task, random_task
+from common.world_config import StartRanges
 from curriculum.adaptive_filtering import fit_normal, get_anchored_task, get_dynamic_task, get_task_type
 from curriculum.success_network import SuccessNetwork
 from curriculum.task_store import CriticView, Entry, TaskStore

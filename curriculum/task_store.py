@@ -11,12 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from common.cells import CELLS
 from common.config import Config
 from common.errors import UsageError
 from common.messages import Candidate, MessageError, Version
 from common.networks import Perception, Policy, TwinCritic, initial_q, load_state
 from common.observation import Observation, ObservationLayout
-from common.tasks import CELLS, GeometricProperties, Scene, Task, build_scene, geometric_properties
+from common.tasks import GeometricProperties, Scene, Task, build_scene, geometric_properties
 
 
 @dataclass(slots=True, eq=False)

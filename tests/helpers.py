@@ -1,15 +1,18 @@
-"""Small things that several tests need: free ports, waiting with a deadline, episodes to send about."""
+"""Small things that several tests need: free ports, waiting with a deadline, episodes, shapely's polygons."""
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from shapely import Polygon
 
 from common.config import Config, resolve
+from common.geometry import SE2, Rectangle
 from common.messages import Ending, Episode, Version
 from common.observation import ACTION_SIZE, ObservationLayout
 from common.tasks import Task
@@ -80,3 +83,21 @@ def small_config(*overrides: str) -> Config:
         "replay.warmup_steps=1",
     )
     return resolve("smoke", overrides=(*small, *overrides))
+
+
+def in_frame(pose: SE2, right: float, ahead: float) -> tuple[float, float]:
+    """The point that lies so far to the right of and ahead of a pose: yaw counts from +y to the left."""
+    c, s = math.cos(pose.yaw), math.sin(pose.yaw)
+    return pose.x + right * c - ahead * s, pose.y + right * s + ahead * c
+
+
+def strip(pose: SE2, left: float, right: float, back: float, front: float) -> Polygon:
+    """What lies within those bounds in the frame of a pose, for shapely."""
+    corners = ((left, back), (right, back), (right, front), (left, front))
+    return Polygon([in_frame(pose, *corner) for corner in corners])
+
+
+def polygon(rectangle: Rectangle) -> Polygon:
+    """A rectangle for shapely, which then judges in place of the functions under test."""
+    x, y = rectangle.half_x, rectangle.half_y
+    return strip(rectangle.pose, -x, x, -y, y)

@@ -45,7 +45,7 @@ def call(monkeypatch, capsys, *arguments):
         (["evaluate", ".", "--suite", "short"], "no policy"),
         (["world", "preview", "--out", "x.png", "--cell", "9"], "cells are 0 to 8"),
         (["world", "preview", "--out", "nowhere/x.png"], "does not exist"),
-        (["world", "preview", "--out", "x.jpg"], ".png"),
+        (["world", "preview", "--out", "x.gif"], ".png or .jpg"),
         (["nonsense"], "nonsense"),
         (["train", "--nonsense"], "--nonsense"),
     ],

@@ -1,6 +1,7 @@
 import math
 import tomllib
 from functools import reduce
+from typing import get_args
 
 import pytest
 from hypothesis import given
@@ -8,7 +9,6 @@ from hypothesis import strategies as st
 
 from common.config import (
     Config,
-    StartRanges,
     differing_key,
     known_keys,
     override,
@@ -17,6 +17,17 @@ from common.config import (
     validate,
 )
 from common.errors import UsageError
+from common.world_config import (
+    TRAINING_FLOORS,
+    TRAINING_WALLS,
+    LookRanges,
+    MountConfig,
+    ObstacleConfig,
+    Pattern,
+    Quantity,
+    StartRanges,
+    WorldConfig,
+)
 
 PRESETS = ("paper", "fast", "smoke")
 VARIANTS = ("navacl-q", "rnd", "e2e")
@@ -37,7 +48,11 @@ TASK = {  # facts.md, section 1: the same in every preset
     "world.lidar.beams": 128,
     "world.lidar.fov": 225.0,
     "world.lidar.range": 6.0,
-    "world.lidar.height": 0.20,
+    "world.lidar.noise": 0.0,
+    "world.lidar.dropout": 0.0,
+    "world.robot.mounts.camera": MountConfig(x=0, y=1.273 / 2, z=0.165, yaw=0),
+    "world.robot.mounts.front_lidar": MountConfig(x=-0.630 / 2, y=1.273 / 2, z=0.2, yaw=45),
+    "world.robot.mounts.rear_lidar": MountConfig(x=0.630 / 2, y=-1.273 / 2, z=0.2, yaw=-135),
     "world.reward.step": -0.1,
     "world.reward.slow": -0.05,
     "world.reward.slow_speed": 0.3,
@@ -45,6 +60,7 @@ TASK = {  # facts.md, section 1: the same in every preset
     "world.reward.other_contact": -10.0,
     "world.reward.success": 10.0,
     "world.reward.success_distance": 0.3,
+    "world.start.jitter": 0.5,
     "world.start.distance_min": 1.5,
     "world.start.distance_max": 5.0,
     "world.start.yaw": 90.0,
@@ -54,7 +70,19 @@ TASK = {  # facts.md, section 1: the same in every preset
     "world.obstacles.count_max": 4,
     "world.obstacles.distance_min": 2.0,
     "world.obstacles.distance_max": 5.0,
-    "world.randomize_appearance": True,
+    "world.obstacles.spread": 30.0,
+    "world.obstacles.size": (0.3, 1.2),
+    "world.obstacles.height": (0.4, 1.8),
+    "world.obstacles.clearance": 0.4,
+    "world.randomization.fixed": (),
+    "world.randomization.training.floor_pattern": TRAINING_FLOORS,
+    "world.randomization.training.wall_pattern": TRAINING_WALLS,
+    "world.randomization.training.light_color": (0.85, 1.0),
+    "world.randomization.training.camera_noise": (0.0, 3.0),
+    "world.randomization.validation.floor_pattern": ("diagonal",),
+    "world.randomization.validation.wall_pattern": ("louvres",),
+    "world.randomization.test.floor_pattern": ("herringbone",),
+    "world.randomization.test.wall_pattern": ("cladding",),
 }
 PAPER = {  # facts.md, sections 2 and 3
     "world.max_episode_steps": 100,
@@ -224,9 +252,44 @@ def test_unknown_key_of_a_file_is_refused_too(tmp_path):
         ("encoder.channels=[1,2,3]", r"'encoder\.channels\.3'.*required"),
         ("world.camera.size=81", r"'world\.camera\.size' = 81.*multiple of 16"),
         ("world.start.distance_max=1.0", r"'world\.start'.*distance_min <= distance_max"),
-        ("world.start.distance_max=6.0", r"'world\.start'.*<= 5 m"),
+        ("world.start.distance_min=6.0", r"'world\.start'.*distance_min <= distance_max"),
+        ("world.start.distance_min=0", r"'world\.start\.distance_min' = 0.*greater than 0"),
+        ("world.start.distance_max=21", r"'world\.start\.distance_max' = 21.*less than or equal to 20"),
+        ("world.start.jitter=-0.1", r"'world\.start\.jitter' = -0\.1.*greater than or equal to 0"),
+        ("world.start.jitter=6", r"'world\.start\.jitter' = 6.*less than or equal to 5"),
+        ("world.start.bearing=181", r"'world\.start\.bearing' = 181.*less than or equal to 180"),
+        ("world.start.dolly_yaw=-1", r"'world\.start\.dolly_yaw' = -1.*greater than or equal to 0"),
+        ("curriculum.gate.ranges.bearing=20", r"'curriculum\.gate\.ranges\.bearing' = 20.*equal to 15"),
+        ("world.lidar.noise=-0.1", r"'world\.lidar\.noise' = -0\.1.*greater than or equal to 0"),
+        ("world.lidar.dropout=1.1", r"'world\.lidar\.dropout' = 1\.1.*less than or equal to 1"),
         ("world.obstacles.count_min=5", r"'world\.obstacles'.*count_min <= count_max"),
         ("world.obstacles.distance_min=6", r"'world\.obstacles'.*distance_min <= distance_max"),
+        ("world.obstacles.count_max=13", r"'world\.obstacles\.count_max' = 13.*less than or equal to 12"),
+        ("world.obstacles.spread=91", r"'world\.obstacles\.spread' = 91.*less than or equal to 90"),
+        ("world.obstacles.clearance=-1", r"'world\.obstacles\.clearance' = -1.*greater than or equal"),
+        ("world.obstacles.size=[1.2, 0.3]", r"'world\.obstacles\.size' = \[1\.2, 0\.3\].*must not be above"),
+        ("world.obstacles.height=[2, 1]", r"'world\.obstacles\.height' = \[2, 1\].*must not be above"),
+        ("world.obstacles.size=[0, 1]", r"'world\.obstacles' = .*size and height must be positive"),
+        ("world.obstacles.size=0.5", r"'world\.obstacles\.size' = 0\.5.*valid tuple"),
+        ("world.obstacles.size=[1, 2, 3]", r"'world\.obstacles\.size'.*at most 2 items"),
+        (
+            "world.randomization.training.light_elevation=[80, 30]",
+            r"'world\.randomization\.training\.light_elevation' = \[80, 30\].*must not be above",
+        ),
+        (
+            "world.randomization.test.camera_noise=[1, nan]",
+            r"'world\.randomization\.test\.camera_noise\.1' = nan.*finite number",
+        ),
+        (
+            "world.randomization.training.floor_pattern=['slabs', 'marble']",
+            r"'world\.randomization\.training\.floor_pattern\.1' = 'marble'.*'concrete', 'slabs'",
+        ),
+        (
+            "world.randomization.validation.wall_pattern=[]",
+            r"'world\.randomization\.validation\.wall_pattern' = \[\].*at least 1 item",
+        ),
+        ("world.randomization.fixed=['sun']", r"world\.randomization\.fixed\.0.* = 'sun'.*'light_azimuth'"),
+        ("world.randomization.fixed=all", r"'world\.randomization\.fixed' = 'all'.*valid tuple"),
         ("actor.worlds=0", r"'actor\.worlds' = 0.*greater than or equal to 1"),
         ("sac=3", r"'sac' = 3"),
         ("sac.gamma.x=1", r"'sac\.gamma'.*valid number"),
@@ -261,6 +324,18 @@ def test_override_cannot_relabel_the_preset_or_the_variant(setting):
         ("curriculum.gate={enabled=false, window=5}", "curriculum.gate.window", 5),
         ("world.reward.dolly_contact=-10", "world.reward.dolly_contact", -10.0),
         ("replay.capacity=10_000", "replay.capacity", 10_000),
+        ("world.obstacles.size=[0.5, 0.5]", "world.obstacles.size", (0.5, 0.5)),
+        ("world.randomization.fixed=['all']", "world.randomization.fixed", ("all",)),
+        (
+            "world.randomization.fixed=['light_azimuth', 'camera_noise']",
+            "world.randomization.fixed",
+            ("light_azimuth", "camera_noise"),
+        ),
+        (
+            "world.randomization.training.wall_pattern=['bricks']",
+            "world.randomization.training.wall_pattern",
+            ("bricks",),
+        ),
     ],
 )
 def test_override_takes_toml_values_and_bare_words(setting, key, expected):
@@ -367,7 +442,46 @@ def test_differing_key_is_the_first_one_with_both_values():
     assert differing_key(Config(), Config()) is None
 
 
-def test_ranges_refuse_what_no_cell_has_room_for():
-    for bad in ({"distance_min": 0.0}, {"yaw": 181.0}, {"bearing": 16.0}, {"yaw": math.inf}):
+def test_ranges_refuse_what_means_nothing():
+    for bad in ({"distance_min": 0.0}, {"yaw": 181.0}, {"bearing": -1.0}, {"yaw": math.inf}, {"jitter": 5.1}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             StartRanges(**bad)
+    assert StartRanges(jitter=5, distance_min=20, distance_max=20, yaw=180, bearing=180, dolly_yaw=180)
+
+
+def test_ranges_from_their_ends_to_a_single_value_are_taken():
+    config = ObstacleConfig(size=(0.1, 0.1), height=(0.2, 3.0), clearance=0.0, count_min=12, count_max=12)
+    assert (config.size, config.height) == ((0.1, 0.1), (0.2, 3.0))
+
+
+def test_arenas_look_as_no_training_cell_does():
+    looks = WorldConfig().randomization
+    floors = (looks.training.floor_pattern, looks.validation.floor_pattern, looks.test.floor_pattern)
+    walls = (looks.training.wall_pattern, looks.validation.wall_pattern, looks.test.wall_pattern)
+    for patterns in (floors, walls):
+        assert len({name for names in patterns for name in names}) == sum(len(names) for names in patterns)
+    unseen = {*looks.validation.floor_pattern, *looks.test.floor_pattern, *walls[1], *walls[2]}
+    assert unseen == set(get_args(Pattern)[-4:])
+    assert {*floors[0], *walls[0]} == set(get_args(Pattern)[:-4])
+
+
+def test_every_quantity_that_is_random_can_be_held():
+    assert set(get_args(Quantity)) == set(LookRanges.model_fields)
+    for name in (*get_args(Quantity), "all"):
+        assert resolve(overrides=(f"world.randomization.fixed=['{name}']",)).world.randomization.fixed == (
+            name,
+        )
+
+
+@pytest.mark.parametrize("arena", ["validation", "test"])
+def test_override_of_an_arenas_look_leaves_its_other_values(arena):
+    config = resolve(overrides=(f"world.randomization.{arena}.light_color=[0.5, 0.6]",))
+    looks, before = getattr(config.world.randomization, arena), getattr(Config().world.randomization, arena)
+    assert looks == before.model_copy(update={"light_color": (0.5, 0.6)})
+
+
+@pytest.mark.parametrize("mount", ["camera", "front_lidar", "rear_lidar"])
+def test_override_of_one_coordinate_of_a_mount_leaves_the_others(mount):
+    config = resolve(overrides=(f"world.robot.mounts.{mount}.z=0.25",))
+    before = getattr(Config().world.robot.mounts, mount)
+    assert getattr(config.world.robot.mounts, mount) == before.model_copy(update={"z": 0.25})

@@ -1,8 +1,16 @@
 import pytest
 import torch
 
+from common.cells import CELLS
 from common.config import override, parse, resolve
-from common.contract import accept_contract, check_digest, contract_encoder, digest, make_contract
+from common.contract import (
+    WORLD_VERSION,
+    accept_contract,
+    check_digest,
+    contract_encoder,
+    digest,
+    make_contract,
+)
 from common.errors import UsageError
 from common.messages import ContractReply, MessageError, decode, encode
 from common.networks import make_encoder
@@ -30,6 +38,11 @@ def test_digest_has_its_five_fields_and_repeats():
         ("world.camera.fov=60.0", {"observation"}),
         ("world.lidar.beams=64", {"observation"}),
         ("world.lidar.range=1.5", {"observation"}),
+        ("world.lidar.noise=0.01", {"observation"}),
+        ("world.lidar.dropout=0.1", {"observation"}),
+        ("world.randomization.fixed=['all']", {"observation"}),
+        ("world.randomization.training.camera_noise=[0, 1]", {"observation"}),
+        ("world.randomization.training.wall_pattern=['plain']", {"observation"}),
         ("encoder.kind=residual", {"observation"}),
         ("encoder.frames_per_code=4", {"observation"}),
         ("encoder.channels=[8,8,8,8]", {"observation"}),
@@ -38,6 +51,9 @@ def test_digest_has_its_five_fields_and_repeats():
         ("world.robot.width=0.7", {"dynamics"}),
         ("world.dolly.rail_height=0.2", {"dynamics"}),
         ("world.obstacles.count_max=2", {"dynamics"}),
+        ("world.obstacles.size=[0.3, 1.1]", {"dynamics"}),
+        ("world.obstacles.clearance=0.5", {"dynamics"}),
+        ("world.robot.mounts.camera.z=0.2", {"dynamics"}),
         ("world.control_period=0.1", {"dynamics"}),
         ("world.substeps=18", {"dynamics"}),
         ("world.reward.dolly_contact=-10", {"reward"}),
@@ -55,7 +71,7 @@ def test_digest_reacts_to_what_must_agree_in_the_right_field(setting, fields):
         "seed=9",
         "world.max_evaluation_steps=50",
         "world.start.yaw=20",
-        "world.randomize_appearance=false",
+        "world.start.jitter=1",
         "network.hidden=[16]",
         "sac.gamma=0.5",
         "replay.capacity=5000",
@@ -66,6 +82,22 @@ def test_digest_reacts_to_what_must_agree_in_the_right_field(setting, fields):
 )
 def test_digest_ignores_what_each_process_may_choose(setting):
     assert changed(setting) == set()
+
+
+def test_digest_reacts_to_the_training_cells_and_to_the_worlds_version(monkeypatch):
+    before = digest(CONFIG, b"weights")
+    for name, value in (("CELLS", CELLS[:-1]), ("WORLD_VERSION", WORLD_VERSION + 1)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"common.contract.{name}", value)
+            after = digest(CONFIG, b"weights")
+        assert {field for field in before if before[field] != after[field]} == {"dynamics"}
+    assert digest(CONFIG, b"weights") == before
+
+
+def test_digest_does_not_change_when_a_cells_walls_have_been_looked_at():
+    before = digest(CONFIG, b"weights")
+    assert all(cell.solids and cell.walls and cell.edges for cell in CELLS)
+    assert digest(CONFIG, b"weights") == before
 
 
 def test_digest_of_a_frozen_encoder_is_that_of_its_weights():
@@ -121,13 +153,23 @@ def test_local_overrides_that_keep_the_contract_are_taken():
             "refused by run 'r': dynamics differs: world.robot.max_speed is 0.9 here and 1.2 there",
         ),
         (
-            ("seed=8", "world.randomize_appearance=false", "world.reward.step=-0.2"),
+            ("seed=8", "world.max_evaluation_steps=7", "world.reward.step=-0.2"),
             "refused by run 'r': reward differs: world.reward.step is -0.2 here and -0.1 there",
         ),
         (
             ("actor.worlds=1", "encoder.channels=[8,8,8,8]"),
             "refused by run 'r': observation differs: "
             "encoder.channels is (8, 8, 8, 8) here and (8, 8, 8, 4) there",
+        ),
+        (
+            ("world.randomization.fixed=['light_azimuth']",),
+            "refused by run 'r': observation differs: "
+            "world.randomization.fixed is ('light_azimuth',) here and () there",
+        ),
+        (
+            ("actor.worlds=1", "world.randomization.training.light_color=[0.5, 1.0]"),
+            "refused by run 'r': observation differs: "
+            "world.randomization.training.light_color is (0.5, 1.0) here and (0.85, 1.0) there",
         ),
         (
             ("encoder.end_to_end=true",),

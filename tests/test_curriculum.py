@@ -451,7 +451,8 @@ def test_proposal_has_the_keys_that_programs_read():
     proposal = curriculum.propose(0, 0)
     fields = json.loads(proposal.model_dump_json())
     assert {"id", "requested", "category", "q", "q_reason", "f", "mu", "sigma"} <= fields.keys()
-    assert {"cell", "seed", "start"} == fields["task"].keys()
+    assert {"cell", "seed", "start", "shift"} == fields["task"].keys()
+    assert fields["task"]["shift"] is None
     assert {"distance", "agent_clearance", "goal_clearance", "relative_angle"} <= fields["properties"].keys()
     for name in ("robot", "dolly"):
         x, y, yaw = fields[name]

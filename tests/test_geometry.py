@@ -2,10 +2,24 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from shapely.geometry.polygon import orient
 
-from common.geometry import SE2, Rectangle, bearing, distance_to_rectangle, rectangles_overlap, wrap
+from common.cells import ROOMS
+from common.geometry import (
+    SE2,
+    Rectangle,
+    as_rows,
+    bearing,
+    distance_to_rectangle,
+    inside_polygon,
+    rectangles_overlap,
+    separations,
+    wrap,
+)
+from tests.helpers import polygon
 
 coordinates = st.floats(-20, 20)
 angles = st.floats(-math.pi, math.pi)
@@ -180,3 +194,112 @@ def test_distance_by_hand_beside_an_edge_at_a_corner_and_inside():
     assert distance_to_rectangle(1, 3, rectangle) == pytest.approx(1.5)
     assert distance_to_rectangle(5, 5.5, rectangle) == pytest.approx(5)
     assert distance_to_rectangle(1.9, 1.4, rectangle) == 0
+
+
+# Many rectangles at once
+
+
+def random_pairs(seed: int, batches: int) -> list[tuple[list[Rectangle], list[Rectangle], np.ndarray]]:
+    """Batches of 20 rectangles of one size, 50 of any, and their separations: 1,000 pairs each."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(batches):
+        half = (float(rng.uniform(0.1, 1.5)), float(rng.uniform(0.1, 1.5)))
+        poses = rng.uniform((-2, -2, -4), (2, 2, 4), (20, 3))
+        rows = rng.uniform((-2, -2, -4, 0.1, 0.1), (2, 2, 4, 1.5, 1.5), (50, 5))
+        rows[:5, 2] = poses[:5, 2] + np.arange(5) * math.pi / 2  # some at right angles to each other
+        ours = [Rectangle(SE2(*pose), *half) for pose in poses]
+        theirs = [Rectangle(SE2(*row[:3]), *row[3:]) for row in rows]
+        found.append((ours, theirs, separations(poses, half, rows)))
+    return found
+
+
+def signed_gap(a: shapely.Polygon, b: shapely.Polygon) -> float:
+    """Largest signed distance of the origin from the edges of the hull of all differences b - a.
+
+    Minkowski: the hull holds the origin exactly when a and b meet, then its boundary is as far away as the
+    shortest way apart; its edges are those of a and of b.
+    """
+    pa, pb = (np.array(shape.exterior.coords)[:-1] for shape in (a, b))
+    differences = (pb[None] - pa[:, None]).reshape(-1, 2)
+    ring = np.array(orient(shapely.convex_hull(shapely.multipoints(differences))).exterior.coords)
+    edges, starts = np.diff(ring, axis=0), ring[:-1]
+    lengths = np.linalg.norm(edges, axis=1)
+    outward = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[lengths > 1e-6] / lengths[lengths > 1e-6, None]
+    return float(np.max(-(starts[lengths > 1e-6] * outward).sum(axis=1)))
+
+
+def test_sign_of_a_separation_says_whether_shapely_finds_an_intersection():
+    pairs = touching = 0
+    for ours, theirs, found in random_pairs(seed=1, batches=10):
+        a, b = np.array([polygon(r) for r in ours])[:, None], np.array([polygon(r) for r in theirs])[None]
+        distance, meet = shapely.distance(a, b), shapely.intersects(a, b)
+        clear = np.abs(found) > 1e-9
+        assert clear.mean() > 0.999
+        assert ((found < 0) == meet)[clear].all()
+        assert (found <= distance + 1e-9)[found > 0].all()
+        pairs, touching = pairs + found.size, touching + int(meet.sum())
+    assert pairs == 10_000
+    assert 2000 < touching < 8000
+
+
+def test_separation_agrees_with_the_scalar_test_for_each_pair():
+    for ours, theirs, found in random_pairs(seed=2, batches=10):
+        scalar = [[rectangles_overlap(a, b) for b in theirs] for a in ours]
+        assert ((found < 0) == scalar)[np.abs(found) > 1e-9].all()
+
+
+def test_separation_is_the_signed_distance_from_the_edges_of_the_minkowski_difference():
+    for ours, theirs, found in random_pairs(seed=3, batches=2):
+        expected = [[signed_gap(polygon(a), polygon(b)) for b in theirs] for a in ours]
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pose", "half", "other", "expected"),
+    [
+        ((0, 0, 0), (1, 1), (1.5, 0, 0, 1, 1), -0.5),  # side by side, half a metre into each other
+        ((0, 0, 0), (1, 1), (0.3, -1.8, 0, 1, 1), -0.2),  # the shorter way out is along y
+        ((0, 0, 0), (2, 0.1), (0, 0, 0, 0.1, 2), -2.1),  # a cross, whose bars lie under each other
+        ((3, 4, 0), (1, 1), (3, 4, 0, 0.2, 0.3), -1.2),  # one within the other
+        ((0, 0, 0), (1, 1), (0, 0, math.pi / 2, 0.2, 0.3), -1.2),  # turned, it is 0.3 wide and 0.2 deep
+        ((0, 0, math.pi / 4), (1, 1), (2, 0, 0, 1, 1), 1 - math.sqrt(2)),  # a corner pokes into a side
+        ((0, 0, math.pi / 4), (1, 1), (3, 0, 0, 1, 1), 2 - math.sqrt(2)),
+        ((0, 0, 0), (1, 0.5), (4, 0, 0, 1, 0.5), 2.0),  # apart along x
+        ((0, 0, 0), (1, 0.5), (0, -4, math.pi, 1, 0.5), 3.0),
+        ((0, 0, 0), (1, 1), (5, 6, 0, 1, 1), 4.0),  # diagonal: 3 and 4 along the axes, 5 in fact
+        ((0, 0, 0), (1, 1), (2, 0, 0, 1, 1), 0.0),  # touching
+    ],
+)
+def test_separation_by_hand(pose, half, other, expected):
+    found = separations(np.array([pose], float), half, np.array([other], float))
+    assert found.shape == (1, 1)
+    assert found[0, 0] == pytest.approx(expected, abs=1e-12)
+
+
+def test_rows_hold_pose_and_half_extents_and_are_empty_for_no_rectangles():
+    rows = as_rows([Rectangle(SE2(1, 2, 0.5), 3, 4), Rectangle(SE2(-1, 0, 0), 0.5, 0.25)])
+    assert rows.tolist() == [[1, 2, 0.5, 3, 4], [-1, 0, 0, 0.5, 0.25]]
+    assert rows.dtype == np.float64
+    assert as_rows(iter(())).shape == (0, 5)
+    assert separations(np.zeros((4, 3)), (1, 1), as_rows([])).shape == (4, 0)
+
+
+STAR = ((0, 3), (-0.7, 0.9), (-3, 1), (-1.2, -0.4), (-2, -2.6), (0, -1.3), (2, -2.6), (1.2, -0.4), (3, 1))
+"""Slanted edges, which no room has."""
+
+
+@pytest.mark.parametrize(
+    "corners", [*(room.outline for room in ROOMS), STAR], ids=[*(room.name for room in ROOMS), "star"]
+)
+def test_points_inside_a_polygon_are_those_that_shapely_finds_inside(corners):
+    rng, shape = np.random.default_rng(5), shapely.Polygon(corners)
+    left, back, right, front = shape.bounds
+    points = rng.uniform((left - 1, back - 1), (right + 1, front + 1), (3000, 2))
+    points[:1000, 1] = rng.choice([y for _, y in corners], 1000)  # rays that pass through corners
+    off = shapely.distance(shape.boundary, shapely.points(points)) > 1e-9
+    assert off.mean() > 0.6
+    expected = shapely.contains_xy(shape, points)
+    for order in (corners, corners[::-1]):
+        found = np.array([inside_polygon(x, y, order) for x, y in points.tolist()])
+        assert (found == expected)[off].all()
+    assert 0.15 < expected[off].mean() < 0.95

@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from common import messages as m
-from common.config import StartRanges, resolve
+from common.config import resolve
 from common.messages import MessageError, decode, encode
 from common.observation import ObservationLayout
-from common.tasks import GeometricProperties, Task
+from common.tasks import DollyShift, GeometricProperties, PlacedStart, Task
+from common.world_config import StartRanges
 from tests.helpers import tiny_episode
 
 CONFIG = resolve("smoke")
@@ -26,7 +27,9 @@ tasks = st.builds(
     Task,
     cell=st.integers(0, 8),
     seed=st.integers(0, 2**53 - 1),
-    start=st.builds(StartRanges, yaw=st.floats(0, 180), bearing=st.floats(0, 15)),
+    start=st.builds(StartRanges, yaw=st.floats(0, 180), bearing=st.floats(0, 15))
+    | st.builds(PlacedStart, x=st.floats(-20, 20), y=st.floats(-20, 20), yaw=st.floats(-180, 180)),
+    shift=st.none() | st.builds(DollyShift, step=st.integers(1, 10_000), x=st.floats(-10, 10)),
 )
 properties = st.builds(GeometricProperties, **dict.fromkeys(GeometricProperties.model_fields, numbers))
 arrays = st.sampled_from([np.float16, np.float32, np.float64, np.uint8]).flatmap(
@@ -210,6 +213,7 @@ def test_fields_that_are_no_mapping_are_refused(fields):
         (m.Nothing, {b"x": 1}, r"Nothing\."),
         (m.TaskQuery, {}, r"TaskQuery\.cell: Field required"),
         (m.TaskQuery, {"cell": 9}, r"TaskQuery\.cell: Input should be less than 9"),
+        (m.TaskQuery, {"cell": 10}, r"TaskQuery\.cell: Input should be less than 9"),
         (m.TaskQuery, {"cell": -1}, r"TaskQuery\.cell: "),
         (m.TaskQuery, {"cell": 0, "t": -1}, r"TaskQuery\.t: "),
         (m.TaskQuery, {"cell": 0, "count": 0}, r"TaskQuery\.count: "),
@@ -227,6 +231,59 @@ def test_fields_that_are_no_mapping_are_refused(fields):
 def test_unknown_missing_and_impossible_fields_are_refused_by_name(kind, fields, said):
     with pytest.raises(MessageError, match=said):
         decode(kind, packed(kind, fields))
+
+
+@pytest.mark.parametrize("cell", [9, 10])
+def test_task_in_an_arena_is_refused_wherever_a_message_holds_one(cell):
+    proposal, episode = sample_proposals().tasks[0], fields_of(tiny_episode(CONFIG))
+    arena = Task(cell=cell, seed=77, start=StartRanges()).model_dump()
+    candidate = {"task": arena, "visual": episode["visual"], "lidar": episode["lidar"]}
+    outcome = m.Outcome(
+        digest={},
+        proposal="p-1",
+        task=proposal.task,
+        properties=proposal.properties,
+        q=None,
+        success=True,
+        category="easy",
+    )
+    said = f"cell {cell} is an arena, where nothing is trained"
+    for kind, fields, place in (
+        (m.Episode, {**episode, "task": arena}, "Episode.task"),
+        (m.Outcome, {**fields_of(outcome), "task": arena}, "Outcome.task"),
+        (m.Candidate, candidate, "Candidate.task"),
+        (m.Candidates, {"digest": {}, "candidates": [candidate]}, "Candidates.candidates.0.task"),
+        (m.Proposals, {"tasks": [{**fields_of(proposal), "task": arena}]}, "Proposals.tasks.0.task"),
+    ):
+        with pytest.raises(MessageError, match=said) as caught:
+            decode(kind, packed(kind, fields))
+        assert str(caught.value).startswith(f"{place}: ")
+
+
+def test_task_in_an_arena_does_not_even_leave():
+    arena = Task(cell=9, seed=0, start=StartRanges())
+    with pytest.raises(ValueError, match="cell 9 is an arena"):
+        m.Candidate(task=arena, visual=np.zeros(1), lidar=np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"cell": 11}, r"Outcome\.task\.cell: Input should be less than 11"),
+        ({"cell": "0x"}, r"Outcome\.task\.cell: "),
+        ({"seed": 2**53}, r"Outcome\.task\.seed: "),
+        ({"start": {"x": 1.0, "y": 2.0, "yaw": 3.0, "jitter": 0.5}}, r"Outcome\.task\.start"),
+        ({"start": {"x": 1.0, "y": 2.0}}, r"Outcome\.task\.start"),
+        ({"shift": {"step": 0}}, r"Outcome\.task\.shift\.step: "),
+        ({"shift": {"step": 1, "x": 11.0}}, r"Outcome\.task\.shift\.x: "),
+    ],
+)
+def test_impossible_task_is_refused_by_its_field(change, said):
+    proposal = sample_proposals().tasks[0]
+    task = {**proposal.task.model_dump(), **change}
+    fields = {"digest": {}, "proposal": "p", "task": task, "properties": proposal.properties.model_dump()}
+    with pytest.raises(MessageError, match=said):
+        decode(m.Outcome, packed(m.Outcome, {**fields, "q": None, "success": True, "category": "easy"}))
 
 
 @pytest.mark.parametrize(
@@ -278,7 +335,12 @@ def test_oversize_is_refused_before_sending_and_after_receiving():
 def test_a_full_answer_to_the_largest_question_fits():
     proposal = m.Proposal(
         id="x" * 64,
-        task=Task(cell=8, seed=2**53 - 1, start=StartRanges()),
+        task=Task(
+            cell=8,
+            seed=2**53 - 1,
+            start=StartRanges(),
+            shift=DollyShift(step=10_000, x=0.1, y=0.1, yaw=0.1),
+        ),
         requested="frontier",
         category="c" * 32,
         properties=GeometricProperties(**dict.fromkeys(GeometricProperties.model_fields, 0.1)),

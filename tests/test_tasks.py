@@ -1,73 +1,155 @@
+import dataclasses
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
+from shapely import Polygon, prepare, union_all
 
-from common.config import Config, StartRanges, resolve
+from common.cells import CELLS, ROOMS, Box
+from common.config import Config, FavourableRanges, resolve
 from common.errors import UsageError
-from common.geometry import SE2, Rectangle, bearing, distance_to_rectangle, rectangles_overlap
+from common.geometry import SE2, Rectangle, bearing, rectangles_overlap
 from common.tasks import (
-    CELLS,
+    GRID_HEADINGS,
     SUITES,
-    Box,
+    DollyShift,
     GeometricProperties,
+    Obstacle,
+    PlacedStart,
     Scene,
     Task,
     build_scene,
     candidate_task,
-    check_cell,
+    docking_corridor,
     dolly_sides,
     geometric_properties,
+    grid,
+    obstacle_catalogue,
     random_stream,
     random_task,
     suite,
 )
+from common.world_config import ObstacleConfig, StartRanges
+from tests.helpers import in_frame, polygon, strip
 
 CONFIG = Config()
-PER_CELL = 300
-KNOWN_SCENE = (
-    SE2(x=0.3042813117812986, y=0.2521547949254309, yaw=0.7002639952353674),
-    SE2(x=-0.25358552026471715, y=4.8791410135873585, yaw=0.17012066035478057),
-    2,
+WORLD = CONFIG.world
+FEW, MANY = 540, 2223  # tasks of each of the nine cells: 4,860 and 20,007
+WIDE = StartRanges(jitter=2.5, distance_min=1.0, distance_max=6.0, yaw=180, bearing=60, dolly_yaw=90)
+KNOWN_SCENE = Scene(
+    SE2(x=0.2521547949254309, y=0.2229009526219764, yaw=1.2660576619661172),
+    SE2(x=-0.2643539891271358, y=4.506860651147172, yaw=0.17012066035478057),
+    (),
 )
+KNOWN_OBSTACLES = [(9, 2.0215678618009223, 3.4071390511215967), (5, -3.5625698513162645, 3.8896068559272026)]
+SOLIDS = [union_all([polygon(solid) for solid in room.solids]) for room in ROOMS]
+INTERIORS = [Polygon(room.outline) for room in ROOMS]
+for shape in (*SOLIDS, *INTERIORS):
+    prepare(shape)
+
+
+def draw(per_cell: int) -> list[tuple[Task, Scene]]:
+    rng = np.random.default_rng(7)
+    tasks = [random_task(cell, CONFIG, rng) for cell in range(len(CELLS)) for _ in range(per_cell)]
+    return [(task, build_scene(task, WORLD)) for task in tasks]
+
+
+@pytest.fixture(scope="module", params=[FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+def scenes(request) -> list[tuple[Task, Scene]]:
+    """Tasks of the full training distribution, as many of each cell, and their scenes."""
+    return draw(request.param)
 
 
 @pytest.fixture(scope="module")
-def scenes() -> list[tuple[Task, Scene]]:
-    rng = np.random.default_rng(7)
-    tasks = [random_task(cell, CONFIG, rng) for cell in range(len(CELLS)) for _ in range(PER_CELL)]
-    return [(task, build_scene(task, CONFIG.world)) for task in tasks]
+def wide() -> list[tuple[Task, Scene]]:
+    """Starts from ranges so wide that most draws hit something, in all eleven rooms."""
+    tasks = [Task(cell=seed % len(ROOMS), seed=seed, start=WIDE) for seed in range(440)]
+    return [(task, build_scene(task, WORLD)) for task in tasks]
 
 
-def footprints(scene: Scene) -> tuple[Rectangle, Rectangle]:
-    """Robot and dolly, sizes from appendix C."""
-    return Rectangle(scene.robot, 0.630 / 2, 1.273 / 2), Rectangle(scene.dolly, 0.820 / 2, 1.230 / 2)
+# What a free start is, by shapely and with the sizes of appendix C
 
 
-def test_there_are_nine_cells_of_different_size_and_layout():
-    assert len(CELLS) == 9
-    assert len({(c.left, c.right, c.back, c.front) for c in CELLS}) == 9
-    assert len({c.fixtures for c in CELLS}) >= 8
+def robot_of(scene: Scene) -> Polygon:
+    return strip(scene.robot, -0.315, 0.315, -0.6365, 0.6365)
+
+
+def dolly_at(pose: SE2) -> Polygon:
+    return strip(pose, -0.41, 0.41, -0.615, 0.615)
+
+
+def corridor_of(dolly: SE2, robot: SE2) -> Polygon:
+    """The robot's length and width with 10 cm on every side, from the dolly's edge towards the robot."""
+    along = (robot.x - dolly.x) * -math.sin(dolly.yaw) + (robot.y - dolly.y) * math.cos(dolly.yaw)
+    near, far = 0.615, 0.615 + 1.273 + 0.2
+    return strip(dolly, -0.415, 0.415, *((near, far) if along > 0 else (-far, -near)))
+
+
+def assert_no_contact(task: Task, scene: Scene) -> None:
+    robot = robot_of(scene)
+    for body in (robot, dolly_at(scene.dolly)):
+        assert INTERIORS[task.cell].contains(body), task
+        assert SOLIDS[task.cell].distance(body) >= 0.02 - 1e-9, task
+    for legs in ((-0.41, -0.37), (0.37, 0.41)):
+        assert strip(scene.dolly, *legs, -0.615, 0.615).distance(robot) >= 0.02 - 1e-9, task
+
+
+def assert_corridor(task: Task, scene: Scene, dolly: SE2 | None = None) -> None:
+    corridor = corridor_of(dolly or scene.dolly, scene.robot)
+    assert INTERIORS[task.cell].buffer(1e-9).contains(corridor), task
+    assert SOLIDS[task.cell].intersection(corridor).area < 1e-9, task
+    for obstacle in scene.obstacles:
+        assert polygon(obstacle.box.footprint).distance(corridor) >= 0.4 - 1e-9, task
+
+
+def assert_obstacles(task: Task, scene: Scene) -> None:
+    catalogue, standing = obstacle_catalogue(WORLD.obstacles), list[Polygon]()
+    assert len({obstacle.index for obstacle in scene.obstacles}) == len(scene.obstacles)
+    for obstacle in scene.obstacles:
+        box, shape = obstacle.box, polygon(obstacle.box.footprint)
+        assert (box.footprint.half_x, box.footprint.half_y, box.height, box.kind) == catalogue[obstacle.index]
+        assert INTERIORS[task.cell].contains(shape), task
+        assert SOLIDS[task.cell].intersection(shape).area < 1e-9, task
+        assert all(shape.intersection(other).area < 1e-9 for other in standing), task
+        standing.append(shape)
+        for body in (robot_of(scene), dolly_at(scene.dolly)):
+            assert shape.distance(body) >= 0.4 - 1e-9, task
+        away, angle = beside(obstacle, scene)
+        assert 2.0 - 1e-9 <= away <= 5.0 + 1e-9
+        assert angle <= 30 + 1e-9
+
+
+def beside(obstacle: Obstacle, scene: Scene) -> tuple[float, float]:
+    """Distance of an obstacle from the dolly and its angle from the cell's x axis, degrees."""
+    pose = obstacle.box.footprint.pose
+    dx, dy = pose.x - scene.dolly.x, pose.y - scene.dolly.y
+    return math.hypot(dx, dy), math.degrees(math.atan2(abs(dy), abs(dx)))
+
+
+# Random starts
 
 
 def test_scene_is_rebuilt_to_the_bit_from_cell_and_seed(scenes):
-    for task, scene in scenes[:: PER_CELL // 3]:
+    for task, scene in scenes[:: len(scenes) // 30]:
         again = Task.model_validate(task.model_dump(mode="json"))
         assert build_scene(again, Config().world) == scene
 
 
 def test_scene_of_a_known_task_stays_what_it_was():
-    scene = build_scene(Task(cell=3, seed=12345, start=StartRanges()), CONFIG.world)
-    assert (scene.robot, scene.dolly, len(scene.obstacles)) == KNOWN_SCENE
+    scene = build_scene(Task(cell=3, seed=12345, start=StartRanges()), WORLD)
+    assert dataclasses.replace(scene, obstacles=()) == KNOWN_SCENE
+    poses = [(o.index, o.box.footprint.pose.x, o.box.footprint.pose.y) for o in scene.obstacles]
+    assert poses == KNOWN_OBSTACLES
 
 
 def test_scene_depends_on_the_seed_and_on_the_cell():
     start = StartRanges()
     a, b, c = (
-        build_scene(Task(cell=cell, seed=seed, start=start), CONFIG.world)
-        for cell, seed in ((0, 1), (0, 2), (5, 1))
+        build_scene(Task(cell=cell, seed=seed, start=start), WORLD) for cell, seed in ((0, 1), (0, 2), (5, 1))
     )
     assert len({a.robot, b.robot, c.robot}) == 3
 
@@ -79,25 +161,37 @@ def test_streams_of_a_task_differ_by_purpose_and_repeat():
     assert draws == [random_stream(task, purpose).random() for purpose in (0, 1, 2)]
 
 
-def test_starts_keep_to_the_ranges_of_appendix_b_and_reach_their_ends(scenes):
+def quantities(scenes: list[tuple[Task, Scene]]) -> list[tuple[list[float], float, float]]:
+    """Everything that is drawn of a start, with its range in appendix B."""
     robots, dollies = [s.robot for _, s in scenes], [s.dolly for _, s in scenes]
     distance = [math.dist((r.x, r.y), (d.x, d.y)) for r, d in zip(robots, dollies, strict=True)]
-    about_y = [
-        math.degrees(bearing(SE2(r.x, r.y, 0.0), d.x, d.y)) for r, d in zip(robots, dollies, strict=True)
-    ]
-    for values, low, high in (
+    about_y = [math.degrees(math.atan2(r.x - d.x, d.y - r.y)) for r, d in zip(robots, dollies, strict=True)]
+    return [
         ([r.x for r in robots], -0.5, 0.5),
         ([r.y for r in robots], -0.5, 0.5),
         ([math.degrees(r.yaw) for r in robots], -90, 90),
         ([math.degrees(d.yaw) for d in dollies], -15, 15),
         (distance, 1.5, 5.0),
         (about_y, -15, 15),
-    ):
+    ]
+
+
+def kolmogorov(values: list[float], low: float, high: float) -> float:
+    """Kolmogorov's statistic against the uniform distribution; above 1.63 once in a hundred."""
+    cdf = (np.sort(values) - low) / (high - low)
+    ranks = np.arange(1, len(cdf) + 1) / len(cdf)
+    return float(max(np.max(ranks - cdf), np.max(cdf - ranks + 1 / len(cdf))) * math.sqrt(len(cdf)))
+
+
+def test_starts_keep_to_the_ranges_of_appendix_b_and_reach_their_ends(scenes):
+    for values, low, high in quantities(scenes):
         slack = 1e-9 * (high - low)
-        assert low - slack <= min(values)
-        assert max(values) <= high + slack
-        assert min(values) < low + 0.02 * (high - low)
-        assert max(values) > high - 0.02 * (high - low)
+        assert low - slack <= min(values) < low + 0.005 * (high - low)
+        assert high - 0.005 * (high - low) < max(values) <= high + slack
+
+
+def test_all_that_is_drawn_of_a_start_is_flat_within_its_range(scenes):
+    assert max(kolmogorov(*quantity) for quantity in quantities(scenes)) < 1.63
 
 
 def test_direction_of_the_dolly_does_not_follow_the_robots_yaw(scenes):
@@ -108,45 +202,72 @@ def test_direction_of_the_dolly_does_not_follow_the_robots_yaw(scenes):
 
 def test_distances_are_flat_in_every_cell_and_over_all(scenes):
     for cell in range(len(CELLS)):
-        distances = np.sort([geometric_properties(t, s).distance for t, s in scenes if t.cell == cell])
-        cdf = (distances - 1.5) / 3.5
-        ranks = np.arange(1, PER_CELL + 1) / PER_CELL
-        kolmogorov = max(np.max(ranks - cdf), np.max(cdf - ranks + 1 / PER_CELL))
-        assert kolmogorov < 1.63 / math.sqrt(PER_CELL), f"cell {cell}"  # the 1% point
+        distances = [geometric_properties(t, s).distance for t, s in scenes if t.cell == cell]
+        assert len(distances) == len(scenes) / 9
+        assert kolmogorov(distances, 1.5, 5.0) < 1.63, f"cell {cell}"
     counts, _ = np.histogram([geometric_properties(t, s).distance for t, s in scenes], 7, (1.5, 5.0))
     expected = len(scenes) / 7
     assert ((counts - expected) ** 2 / expected).sum() < 16.81  # chi-square, 6 degrees of freedom, 1%
 
 
-def test_no_start_overlaps_anything(scenes):
+def test_no_robot_starts_in_contact_and_every_dolly_stands_clear(scenes):
     for task, scene in scenes:
-        cell, (robot, dolly) = CELLS[task.cell], footprints(scene)
-        fixed = [box.footprint for box in cell.walls() + cell.fixtures]
-        assert not rectangles_overlap(robot, dolly)
-        for body in (robot, dolly):
-            assert not any(rectangles_overlap(body, other) for other in fixed), task
-            assert all(cell.left < x < cell.right and cell.back < y < cell.front for x, y in body.corners())
+        assert_no_contact(task, scene)
+        assert not robot_of(scene).intersects(dolly_at(scene.dolly))
+
+
+def test_every_dolly_has_a_free_docking_corridor_on_the_robots_side(scenes):
+    for task, scene in scenes:
+        assert_corridor(task, scene)
 
 
 def test_one_to_four_obstacles_stand_left_and_right_of_the_dolly_clear_of_everything(scenes):
-    counts, sides = [0] * 6, {-1: 0, 1: 0}
+    counts, sides, used = Counter[int](), Counter[bool](), Counter[int]()
     for task, scene in scenes:
-        cell, bodies = CELLS[task.cell], footprints(scene)
+        assert_obstacles(task, scene)
         counts[len(scene.obstacles)] += 1
-        standing = [box.footprint for box in cell.walls() + cell.fixtures]
-        for box in scene.obstacles:
-            shape = box.footprint
-            dx, dy = shape.pose.x - scene.dolly.x, shape.pose.y - scene.dolly.y
-            assert 2.0 <= math.hypot(dx, dy) <= 5.0
-            assert abs(dx) > abs(dy)
-            sides[1 if dx > 0 else -1] += 1
-            assert not any(rectangles_overlap(shape, other) for other in standing)
-            assert not any(rectangles_overlap(shape, body, 0.39) for body in bodies)
-            assert box.height > 0.2, "lower ones would be invisible to the LiDAR"
-            standing.append(shape)
-    assert counts[0] == counts[5] == 0
-    assert min(counts[1:5]) > 0.15 * len(scenes)
-    assert min(sides.values()) > 0.4 * sum(sides.values())
+        sides.update(o.box.footprint.pose.x > scene.dolly.x for o in scene.obstacles)
+        used.update(o.index for o in scene.obstacles)
+    assert set(counts) == {1, 2, 3, 4}
+    assert min(counts.values()) > 0.2 * len(scenes)
+    assert min(sides.values()) > 0.45 * sum(sides.values())
+    assert set(used) == set(range(12))
+    assert min(used.values()) > 0.05 * sum(used.values())
+
+
+def test_obstacles_reach_the_ends_of_their_ranges(scenes):
+    away, angles = zip(*(beside(o, scene) for _, scene in scenes for o in scene.obstacles), strict=True)
+    assert min(away) < 2.05
+    assert max(away) > 4.95
+    assert max(angles) > 29.7
+    yaws = [o.box.footprint.pose.yaw for _, scene in scenes for o in scene.obstacles]
+    assert min(yaws) < -3.1
+    assert max(yaws) > 3.1
+
+
+def test_starts_from_wide_ranges_are_as_free_in_every_room(wide):
+    for task, scene in wide:
+        assert_no_contact(task, scene)
+        assert_corridor(task, scene)
+        assert_obstacles(task, scene)
+    behind = [scene for _, scene in wide if (scene.dolly.inverse() @ scene.robot).y > 0]
+    assert len(behind) > 10, "some dollies have their corridor at the other end"
+
+
+def test_distances_stay_flat_where_far_ones_seldom_fit():
+    ranges, distances = StartRanges(jitter=1.5, distance_max=10.5), []
+    for seed in range(500):
+        scene = build_scene(Task(cell=6, seed=seed, start=ranges), WORLD)  # 10.8 m from the start to its rack
+        distances.append(math.dist((scene.robot.x, scene.robot.y), (scene.dolly.x, scene.dolly.y)))
+    assert kolmogorov(distances, 1.5, 10.5) < 1.63
+
+
+def test_jitter_of_the_ranges_bounds_the_robots_place():
+    for jitter in (0.0, 1.5):
+        start = StartRanges(jitter=jitter)
+        robots = [build_scene(Task(cell=0, seed=seed, start=start), WORLD).robot for seed in range(100)]
+        reach = max(max(abs(robot.x), abs(robot.y)) for robot in robots)
+        assert 0.95 * jitter <= reach <= jitter
 
 
 def test_obstacles_keep_their_distance_even_when_they_may_stand_close():
@@ -154,26 +275,40 @@ def test_obstacles_keep_their_distance_even_when_they_may_stand_close():
     world, gaps = resolve(overrides=settings).world, []
     for seed in range(40):
         scene = build_scene(Task(cell=5, seed=seed, start=StartRanges(distance_max=2.0)), world)
-        for box in scene.obstacles:
-            corners = box.footprint.corners()
-            gaps += [distance_to_rectangle(x, y, body) for x, y in corners for body in footprints(scene)]
-    assert 0.4 <= min(gaps) < 0.5
+        kept = (robot_of(scene), dolly_at(scene.dolly), corridor_of(scene.dolly, scene.robot))
+        gaps += [polygon(o.box.footprint).distance(body) for o in scene.obstacles for body in kept]
+    assert 0.4 - 1e-9 <= min(gaps) < 0.42
+
+
+def test_clearance_and_spread_of_the_obstacles_follow_the_configuration():
+    world = resolve(overrides=("world.obstacles.clearance=0.9", "world.obstacles.spread=80")).world
+    angles, gaps = [], []
+    for seed in range(200):
+        scene = build_scene(Task(cell=5, seed=seed, start=StartRanges()), world)
+        kept = (robot_of(scene), dolly_at(scene.dolly), corridor_of(scene.dolly, scene.robot))
+        gaps += [polygon(o.box.footprint).distance(body) for o in scene.obstacles for body in kept]
+        angles += [beside(o, scene)[1] for o in scene.obstacles]
+    assert 0.9 - 1e-9 <= min(gaps) < 0.95
+    assert 60 < max(angles) <= 80
 
 
 def test_favourable_starts_touch_nothing_and_are_not_docked_yet():
     ranges = CONFIG.curriculum.gate.ranges
+    under = 0
     for seed in range(200):
-        scene = build_scene(Task(cell=seed % 9, seed=seed, start=ranges), CONFIG.world)
-        robot, _ = footprints(scene)
-        assert not any(rectangles_overlap(robot, side) for side in dolly_sides(scene.dolly, CONFIG.world))
+        task = Task(cell=seed % 9, seed=seed, start=ranges)
+        scene = build_scene(task, WORLD)
+        assert_no_contact(task, scene)
         distance = math.dist((scene.robot.x, scene.robot.y), (scene.dolly.x, scene.dolly.y))
         assert ranges.distance_min - 1e-9 <= distance <= ranges.distance_max + 1e-9
-        assert distance > CONFIG.world.reward.success_distance
+        assert distance > WORLD.reward.success_distance
+        under += robot_of(scene).intersects(dolly_at(scene.dolly))
+    assert under > 50
 
 
 def test_sides_of_the_dolly_hold_the_legs_and_leave_the_tunnel_free():
     pose = SE2(1.0, 2.0, math.radians(90))
-    sides = dolly_sides(pose, CONFIG.world)
+    sides = dolly_sides(pose, WORLD)
     for side in sides:
         assert (side.half_x, side.half_y) == (0.02, 1.230 / 2)
     # turned by 90 deg, the dolly's left is the cell's -y
@@ -182,31 +317,408 @@ def test_sides_of_the_dolly_hold_the_legs_and_leave_the_tunnel_free():
     assert all(rectangles_overlap(Rectangle(pose, 0.371, 0.6), side) for side in sides)
 
 
+def test_docking_corridor_by_hand_on_either_side_of_a_turned_dolly():
+    dolly = SE2(1.0, 2.0, math.radians(90))  # its forward is the cell's -x
+    for robot_x, expected in ((4.0, (1.615, 1.585, 3.088, 2.415)), (-2.0, (-1.088, 1.585, 0.385, 2.415))):
+        found = docking_corridor(dolly, SE2(robot_x, 2.5, 0.3), WORLD)
+        assert polygon(found).bounds == pytest.approx(expected)
+        assert found.pose.yaw == dolly.yaw
+
+
+# The boxes that stand about
+
+
 def test_number_of_obstacles_follows_the_configuration():
-    world = resolve(overrides=("world.obstacles.count_min=0", "world.obstacles.count_max=0")).world
-    assert build_scene(Task(cell=0, seed=1, start=StartRanges()), world).obstacles == ()
+    for count in (0, 3, 12):
+        settings = (f"world.obstacles.count_min={count}", f"world.obstacles.count_max={count}")
+        for cell in range(len(ROOMS)):
+            task = Task(cell=cell, seed=1, start=StartRanges())
+            scene = build_scene(task, resolve(overrides=settings).world)
+            assert len(scene.obstacles) == count
+            assert_obstacles(task, scene)
 
 
-def test_a_start_without_free_space_is_a_usage_error():
-    world = resolve(overrides=("world.dolly.width=30.0",)).world
-    with pytest.raises(UsageError, match=r"no free start in cell 2 for distances 1\.5 to 5"):
-        build_scene(Task(cell=2, seed=1, start=StartRanges()), world)
+@pytest.mark.parametrize("config", [ObstacleConfig(), ObstacleConfig(size=(0.2, 3.0), height=(1.0, 1.1))])
+def test_catalogue_fills_the_ranges_of_the_configuration(config):
+    catalogue = obstacle_catalogue(config)
+    assert len(catalogue) == 12
+    half_x, half_y, height, kinds = zip(*catalogue, strict=True)
+    for values, (low, high) in ((half_x, config.size), (half_y, config.size), (height, config.height)):
+        share = (np.sort(values) * (1 if values is height else 2) - low) / (high - low)
+        assert 0 <= share[0] < 0.1
+        assert 0.9 < share[-1] <= 1
+        assert np.diff(share).max() < 0.15
+    assert abs(np.corrcoef(half_x, half_y)[0, 1]) < 0.5, "long ones and square ones"
+    assert Counter(kinds) == {"crate": 4, "pallet": 4, "machine": 4}
 
 
-def test_walls_enclose_the_room_without_a_gap_and_outside_its_inner_faces():
-    cell = CELLS[1]
-    left, right, back, front = (box.footprint for box in cell.walls())
-    assert distance_to_rectangle(0, 0, left) == pytest.approx(4.5)
-    assert distance_to_rectangle(0, 0, right) == pytest.approx(7.0)
-    assert distance_to_rectangle(0, 0, back) == pytest.approx(2.0)
-    assert distance_to_rectangle(0, 0, front) == pytest.approx(8.0)
-    for x, y in ((-4.55, -2.05), (7.05, -2.05), (7.05, 8.05), (-4.55, 8.05)):
-        assert min(distance_to_rectangle(x, y, w) for w in (left, right, back, front)) == 0
+def test_catalogue_of_a_single_size_has_only_that():
+    for half_x, half_y, height, _ in obstacle_catalogue(ObstacleConfig(size=(0.8, 0.8), height=(1.5, 1.5))):
+        assert (half_x, half_y, height) == (0.4, 0.4, 1.5)
+
+
+# Placed starts and the grid
+
+
+@pytest.mark.parametrize("cell", range(len(ROOMS)))
+def test_placed_start_puts_the_robot_at_its_pose_in_the_dollys_frame(cell):
+    task = Task(cell=cell, seed=3, start=PlacedStart(x=0.75, y=-2.5, yaw=-35))
+    scene = build_scene(task, WORLD)
+    room = ROOMS[cell]
+    assert scene.dolly == room.dolly
+    assert room.dolly.yaw == 0
+    assert (scene.robot.x, scene.robot.y) == pytest.approx((room.dolly.x + 0.75, room.dolly.y - 2.5))
+    assert math.degrees(scene.robot.yaw) == pytest.approx(-35)
+    assert_no_contact(task, scene)
+    assert_corridor(task, scene)
+    assert_obstacles(task, scene)
+
+
+def test_placed_start_follows_a_dolly_that_is_turned(monkeypatch):
+    turned = dataclasses.replace(ROOMS[0], dolly=SE2(1.0, 4.0, math.radians(90)))  # looks along -x
+    monkeypatch.setattr("common.tasks.ROOMS", (turned, *ROOMS[1:]))
+    scene = build_scene(Task(cell=0, seed=1, start=PlacedStart(x=1.0, y=-2.0, yaw=30)), WORLD)
+    assert scene.dolly == SE2(1.0, 4.0, math.radians(90))
+    assert (scene.robot.x, scene.robot.y) == pytest.approx((3.0, 5.0))
+    assert math.degrees(scene.robot.yaw) == pytest.approx(120)
+
+
+def test_placed_start_may_be_behind_the_dolly_or_under_it():
+    behind = Task(cell=9, seed=1, start=PlacedStart(x=0.3, y=3.0, yaw=180))
+    assert_corridor(behind, build_scene(behind, WORLD))
+    assert corridor_of(ROOMS[9].dolly, SE2(0.3, 8.0)).bounds[1] > ROOMS[9].dolly.y
+    under = Task(cell=9, seed=1, start=PlacedStart(x=0.0, y=0.0, yaw=0.0))
+    scene = build_scene(under, WORLD)
+    assert scene.robot == scene.dolly == ROOMS[9].dolly
+    assert_no_contact(under, scene)
+
+
+def test_grid_has_every_start_of_section_4_2_once_in_each_repeat():
+    assert GRID_HEADINGS == (0, -45, 45, -90, 90, -135, 135, 180)
+    tasks = grid("validation", 1)
+    assert len(tasks) == 968
+    assert {task.cell for task in tasks} == {9}
+    starts = {(t.start.x, t.start.y, t.start.yaw) for t in tasks if isinstance(t.start, PlacedStart)}
+    steps = [0.5 * k for k in range(11)]
+    assert starts == {(-2.5 + dx, -1.5 - dy, yaw) for dx in steps for dy in steps for yaw in GRID_HEADINGS}
+    assert len(starts) == 968
+    assert len({(x, y) for x, y, _ in starts}) == 121
+    assert (min(x for x, *_ in starts), max(x for x, *_ in starts)) == (-2.5, 2.5)
+    assert (max(y for _, y, _ in starts), min(y for _, y, _ in starts)) == (-1.5, -6.5)
+    assert {task.cell for task in grid("test", 1)} == {10}
+    assert [t.start for t in grid("test", 2)] == [t.start for t in tasks] * 2
+
+
+def test_seeds_of_a_grid_are_its_own():
+    nine = [task.seed for task in grid("test", 9)]
+    assert len(nine) == len(set(nine)) == 8712
+    assert nine[:968] == [task.seed for task in grid("test", 1)], "one repeat is the first of nine"
+    assert nine == [task.seed for task in grid("test", 9)]
+    other = [task.seed for task in grid("test", 9, seed=1)]
+    suites = [task.seed for name in SUITES for task in suite(name, CONFIG)]
+    assert len({*nine, *other, *suites}) == 2 * 8712 + 500
+    assert min(nine) >= 2**32, "training draws none of them"
+
+
+@pytest.mark.parametrize("arena", ["validation", "test"])
+def test_all_starts_of_a_grid_are_free_and_where_they_should_be(arena):
+    for task in grid(arena, 1):
+        scene = build_scene(task, WORLD)
+        start, dolly = task.start, ROOMS[task.cell].dolly
+        assert isinstance(start, PlacedStart)
+        assert scene.dolly == dolly
+        assert (scene.robot.x - dolly.x, scene.robot.y - dolly.y) == pytest.approx((start.x, start.y))
+        assert math.remainder(math.degrees(scene.robot.yaw) - start.yaw, 360) == pytest.approx(0, abs=1e-9)
+        assert_no_contact(task, scene)
+        assert_corridor(task, scene)
+        assert_obstacles(task, scene)
+
+
+@pytest.mark.parametrize("arena", ["validation", "test"])
+def test_repeats_of_a_grid_differ_in_the_obstacles_and_never_in_the_start(arena):
+    tasks = grid(arena, 9)
+    for first in range(0, 968, 88):
+        repeats = [build_scene(task, WORLD) for task in tasks[first::968]]
+        assert len(repeats) == 9
+        assert len({scene.robot for scene in repeats}) == len({scene.dolly for scene in repeats}) == 1
+        assert len({scene.obstacles for scene in repeats}) == 9
+
+
+def test_unknown_arena_is_a_usage_error():
+    with pytest.raises(UsageError, match="arena 'hall' does not exist; choose one of validation, test"):
+        grid("hall", 1)
+
+
+# A dolly that moves
+
+
+def test_shifted_dolly_is_where_the_displacement_in_its_own_frame_says():
+    shift = DollyShift(step=20, x=1.0, y=-0.5, yaw=20)
+    placed = Task(cell=9, seed=1, start=PlacedStart(x=0.5, y=-4, yaw=10), shift=shift)
+    found = build_scene(placed, WORLD).shifted
+    assert found is not None
+    assert (found.x, found.y, math.degrees(found.yaw)) == pytest.approx((1.0, 4.5, 20))
+    for seed in range(20):
+        scene = build_scene(Task(cell=5, seed=seed, start=StartRanges(), shift=shift), WORLD)
+        assert scene.shifted is not None
+        assert (scene.shifted.x, scene.shifted.y) == pytest.approx(in_frame(scene.dolly, 1.0, -0.5))
+        assert scene.shifted.yaw == pytest.approx(scene.dolly.yaw + math.radians(20))
+
+
+def test_dolly_that_does_not_move_has_no_second_place():
+    assert build_scene(Task(cell=9, seed=1, start=StartRanges()), WORLD).shifted is None
+
+
+def test_second_place_of_the_dolly_and_its_corridor_are_kept_free_too():
+    shift, would_hit = DollyShift(step=20, x=2.5, y=0.5, yaw=-15), 0
+    for seed in range(100):
+        start = PlacedStart(x=0.0, y=-3.0, yaw=0)
+        still = build_scene(Task(cell=10, seed=seed, start=start), WORLD)
+        task = Task(cell=10, seed=seed, start=start, shift=shift)
+        scene = build_scene(task, WORLD)
+        assert scene.shifted is not None
+        assert_obstacles(task, scene)
+        assert_corridor(task, scene)
+        assert_corridor(task, scene, scene.shifted)
+        assert all(
+            polygon(o.box.footprint).distance(dolly_at(scene.shifted)) >= 0.4 - 1e-9 for o in scene.obstacles
+        )
+        would_hit += any(
+            polygon(o.box.footprint).intersects(dolly_at(scene.shifted)) for o in still.obstacles
+        )
+    assert would_hit > 10
+
+
+@pytest.mark.parametrize(
+    ("shift", "reason"),
+    [
+        (DollyShift(step=5, x=10.0), "the shifted dolly stands in a wall or fixture"),
+        (DollyShift(step=5, x=8.7), "the shifted dolly stands in a wall or fixture"),  # the rack
+        (DollyShift(step=5, y=10.0), "the shifted dolly stands in a wall or fixture"),
+        # between the pillar at (5.2, 0.6) and the robot's line: free itself, the pillar in its way
+        (DollyShift(step=5, x=5.2, y=-2.9), "the shifted dolly has no free docking corridor"),
+    ],
+)
+def test_shift_into_a_wall_or_to_where_none_can_dock_is_refused(shift, reason):
+    task = Task(cell=10, seed=1, start=PlacedStart(x=0, y=-3.5, yaw=0), shift=shift)
+    assert build_scene(task.model_copy(update={"shift": None}), WORLD).shifted is None
+    with pytest.raises(UsageError) as caught:
+        build_scene(task, WORLD)
+    assert str(caught.value) == f"no free start in cell 10 (test): {reason} in 200 of 200 draws"
+
+
+# What cannot be had
+
+
+@pytest.mark.parametrize(
+    ("cell", "start", "settings", "said"),
+    [
+        (
+            0,
+            StartRanges(distance_min=15, distance_max=15),
+            (),
+            "cell 0 (hall) at a distance of 15.00 m: the dolly stands in a wall or fixture",
+        ),
+        (
+            9,
+            PlacedStart(x=4.6, y=-2.8, yaw=0),  # the pillar at (4.6, 2.2)
+            (),
+            "cell 9 (validation): the robot stands in a wall or fixture",
+        ),
+        (
+            9,
+            PlacedStart(x=0, y=-8.5, yaw=0),
+            (),
+            "cell 9 (validation): the robot stands in a wall or fixture",
+        ),
+        (
+            9,
+            PlacedStart(x=20, y=-20, yaw=0),
+            (),
+            "cell 9 (validation): the robot stands in a wall or fixture",
+        ),
+        (9, PlacedStart(x=0, y=0, yaw=90), (), "cell 9 (validation): the robot touches the dolly"),
+        (9, PlacedStart(x=0.7, y=0.2, yaw=0), (), "cell 9 (validation): the robot touches the dolly"),
+        (
+            2,
+            PlacedStart(x=0, y=-3, yaw=0),
+            ("world.dolly.width=30.0",),
+            "cell 2 (pillars): the dolly stands in a wall or fixture",
+        ),
+        (
+            2,
+            PlacedStart(x=0, y=-3, yaw=0),
+            ("world.robot.width=20.0",),
+            "cell 2 (pillars): the robot stands in a wall or fixture",
+        ),
+        (
+            1,
+            PlacedStart(x=0, y=-3, yaw=0),
+            ("world.obstacles.distance_min=20", "world.obstacles.distance_max=21"),
+            "cell 1 (rack wall): the room has no space for the obstacles",
+        ),
+        pytest.param(
+            1,
+            PlacedStart(x=0, y=-3, yaw=0),
+            (
+                "world.obstacles.count_min=12",
+                "world.obstacles.count_max=12",
+                "world.obstacles.size=[3, 3]",
+            ),
+            "cell 1 (rack wall): the room has no space for the obstacles",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_impossible_request_is_a_usage_error_that_names_the_reason(cell, start, settings, said):
+    with pytest.raises(UsageError) as caught:
+        build_scene(Task(cell=cell, seed=1, start=start), resolve(overrides=settings).world)
+    assert str(caught.value) == f"no free start in {said} in 200 of 200 draws"
+
+
+def test_commonest_reason_is_the_one_that_is_named():
+    ranges = StartRanges(jitter=4.0, distance_min=14.0, distance_max=14.0)  # a third of the robots do not fit
+    said = r"cell 6 \(deep aisle\) at a distance of 14\.00 m: the dolly stands .* in \d+ of 200 draws"
+    with pytest.raises(UsageError, match=said) as caught:
+        build_scene(Task(cell=6, seed=1, start=ranges), WORLD)
+    count = int(str(caught.value).split(" of 200")[0].split()[-1])
+    assert 100 < count < 160
+
+
+@pytest.mark.parametrize(
+    ("cell", "start"),
+    [
+        (9, StartRanges(distance_min=10.5, distance_max=11.5)),
+        (10, StartRanges(distance_min=10.5, distance_max=11.5)),
+        (9, PlacedStart(x=-6, y=-8.2, yaw=-40)),
+        (10, PlacedStart(x=-6, y=-9.2, yaw=-40)),
+    ],
+)
+def test_starts_beyond_ten_metres_are_possible_in_both_arenas(cell, start):
+    for seed in range(30):
+        task = Task(cell=cell, seed=seed, start=start)
+        scene = build_scene(task, WORLD)
+        assert math.dist((scene.robot.x, scene.robot.y), (scene.dolly.x, scene.dolly.y)) > 10
+        assert_no_contact(task, scene)
+        assert_corridor(task, scene)
+        assert_obstacles(task, scene)
+
+
+# Tasks as data
+
+
+degrees = st.floats(-180, 180)
+tasks = st.builds(
+    Task,
+    cell=st.integers(0, 10),
+    seed=st.integers(0, 2**53 - 1),
+    start=st.builds(StartRanges, jitter=st.floats(0, 5), bearing=st.floats(0, 180))
+    | st.builds(PlacedStart, x=st.floats(-20, 20), y=st.floats(-20, 20), yaw=degrees),
+    shift=st.none()
+    | st.builds(
+        DollyShift, step=st.integers(1, 10_000), x=st.floats(-10, 10), y=st.floats(-10, 10), yaw=degrees
+    ),
+)
+
+
+@given(tasks)
+def test_task_survives_json_to_the_bit(task):
+    again = Task.model_validate_json(task.model_dump_json())
+    assert again == task
+    assert type(again.start) is type(task.start)
+    assert Task.model_validate(task.model_dump()) == task
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        Task(cell=10, seed=2**53 - 1, start=PlacedStart(x=-1.1, y=-3.3, yaw=77.7)),
+        Task(
+            cell=9,
+            seed=5,
+            start=PlacedStart(x=0.1, y=-3.3, yaw=-33.3),
+            shift=DollyShift(step=3, x=0.7, y=0.1, yaw=12.3),
+        ),
+        Task(cell=4, seed=6, start=StartRanges(yaw=33.3), shift=DollyShift(step=3, x=-0.7)),
+    ],
+)
+def test_scene_is_the_same_to_the_bit_after_json(task):
+    scene = build_scene(task, WORLD)
+    assert build_scene(Task.model_validate_json(task.model_dump_json()), Config().world) == scene
+    assert (scene.shifted is None) == (task.shift is None)
+
+
+@pytest.mark.parametrize(
+    ("start", "kind"),
+    [
+        ({}, StartRanges),
+        ({"yaw": 5}, StartRanges),
+        ({"jitter": 0.1, "yaw": 5}, StartRanges),
+        ({"x": 1, "y": -2, "yaw": 5}, PlacedStart),
+    ],
+)
+def test_kind_of_a_start_follows_from_its_keys(start, kind):
+    task = Task.model_validate({"cell": 0, "seed": 0, "start": start})
+    assert type(task.start) is kind
+    assert start.items() <= task.start.model_dump().items()
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        {"x": 1, "y": -2},
+        {"x": 1, "yaw": 5},
+        {"x": 1, "y": -2, "yaw": 5, "jitter": 0.1},
+        {"jitter": 0.1, "x": 1},
+        {"x": 21, "y": -2, "yaw": 5},
+        {"x": 1, "y": -2, "yaw": 181},
+        {"yaw": 181},
+        {"z": 1},
+        None,
+    ],
+)
+def test_start_that_is_neither_kind_is_refused(start):
+    with pytest.raises(ValidationError, match="start"):
+        Task.model_validate({"cell": 0, "seed": 0, "start": start})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cell": 11},
+        {"cell": -1},
+        {"seed": 2**53},
+        {"seed": -1},
+        {"shift": {}},
+        {"shift": {"step": 0}},
+        {"shift": {"step": 10_001}},
+        {"shift": {"step": 1, "x": 10.5}},
+        {"shift": {"step": 1, "yaw": 181}},
+        {"shift": {"step": 1, "z": 1}},
+        {"other": 1},
+    ],
+)
+def test_task_out_of_bounds_is_refused(change):
+    good = {"cell": 0, "seed": 0, "start": {}}
+    Task.model_validate(good)
+    with pytest.raises(ValidationError, match=next(iter(change))):
+        Task.model_validate({**good, **change})
+
+
+def test_favourable_ranges_arrive_as_ranges_with_the_same_numbers():
+    task = Task(cell=3, seed=4, start=FavourableRanges())
+    again = Task.model_validate_json(task.model_dump_json())
+    assert type(again.start) is StartRanges
+    assert again.start.model_dump() == FavourableRanges().model_dump()
+    assert build_scene(again, WORLD) == build_scene(task, WORLD)
+
+
+# What the curriculum sees
 
 
 def test_properties_of_a_scene_worked_by_hand():
     box = Box(Rectangle(SE2(3.0, 3.0, 0.0), 0.5, 0.5), 1.0)
-    scene = Scene(SE2(0, 0, math.radians(-30)), SE2(1, 3, math.radians(10)), (box,))
+    scene = Scene(SE2(0, 0, math.radians(-30)), SE2(1, 3, math.radians(10)), (Obstacle(0, box),))
     found = geometric_properties(Task(cell=0, seed=0, start=StartRanges()), scene)
     towards = math.degrees(math.atan2(1, 3))  # 18.4 deg to the right of +y
     assert found.distance == pytest.approx(math.sqrt(10))
@@ -223,7 +735,7 @@ def test_clearance_counts_fixtures_and_obstacles_near_the_robot_but_never_the_do
     bare = geometric_properties(task, Scene(SE2(3.0, -1.0), SE2(3.0, 0.5), ()))
     assert bare.agent_clearance == pytest.approx(1.2)  # the fixture's top face at y = -2.2
     assert bare.goal_clearance == pytest.approx(2.0)  # the right-hand wall
-    beside = geometric_properties(task, Scene(SE2(0, 0), SE2(0, 2), (box,)))
+    beside = geometric_properties(task, Scene(SE2(0, 0), SE2(0, 2), (Obstacle(0, box),)))
     assert beside.agent_clearance == pytest.approx(1.0)
 
 
@@ -250,9 +762,9 @@ def test_suites_have_their_sizes_cells_and_ranges():
     short, train = suite("short", CONFIG), suite("train", CONFIG)
     assert (len(short), len(train)) == (100, 400)
     assert {t.cell for t in short} == {t.cell for t in train} == set(range(9))
-    assert all(t.start == CONFIG.world.start for t in train)
+    assert all(t.start == WORLD.start for t in train)
     for task in short:
-        found = build_scene(task, CONFIG.world)
+        found = build_scene(task, WORLD)
         properties = geometric_properties(task, found)
         towards = bearing(SE2(found.robot.x, found.robot.y), found.dolly.x, found.dolly.y)
         assert 1.5 - 1e-9 <= properties.distance <= 2.0 + 1e-9
@@ -264,7 +776,7 @@ def test_suites_have_their_sizes_cells_and_ranges():
 def test_suites_are_the_same_every_time_and_buildable():
     assert suite("train", CONFIG) == suite("train", Config(seed=9))
     for task in suite("train", CONFIG):
-        build_scene(task, CONFIG.world)
+        build_scene(task, WORLD)
 
 
 def test_training_never_draws_a_suites_seed():
@@ -277,13 +789,9 @@ def test_training_never_draws_a_suites_seed():
     assert max(drawn) < 2**32 <= min(suites)
 
 
-def test_unknown_suite_and_cell_are_usage_errors():
+def test_unknown_suite_is_a_usage_error():
     with pytest.raises(UsageError, match="suite 'lang' does not exist; choose one of short, train"):
         suite("lang", CONFIG)
-    assert check_cell(8) == 8
-    for cell in (-1, 9):
-        with pytest.raises(UsageError, match=f"cell {cell} does not exist; cells are 0 to 8"):
-            check_cell(cell)
 
 
 def test_share_of_narrowed_candidates_is_the_configured_one():

@@ -1,93 +1,95 @@
-"""What a scene looks like: patterns and colours of floor and walls, colours of boxes, light (section 3.3)."""
+"""How an episode looks: patterns and colours, light, and what the camera makes of it (section 3.3)."""
 
 from __future__ import annotations
 
-import tempfile
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+import colorsys
+import math
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
-from actor.world.sensors import Light
+from common.cells import ARENAS, CELLS
+from common.tasks import CATALOGUE_SIZE
+from common.world_config import LookRanges, Pattern, RandomizationConfig
 
-TEXTURE_SIZE = 64
 Color = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
+class Light:
+    """Illumination of a scene: direction towards the light, colour, ambient and diffuse shares."""
+
+    direction: tuple[float, float, float]
+    color: tuple[float, float, float]
+    ambient: float
+    diffuse: float
+
+
+@dataclass(frozen=True, slots=True)
 class Appearance:
-    """Indices into the texture bank, tints and light of one episode."""
+    """What one episode drew from the ranges of its place."""
 
-    floor_texture: int = 0
-    wall_texture: int = 0
-    floor: Color = (0.75, 0.75, 0.72, 1.0)
-    wall: Color = (0.85, 0.83, 0.78, 1.0)
-    boxes: tuple[Color, ...] = ((0.55, 0.4, 0.25, 1.0),)
-    light: Light = field(default_factory=Light)
+    floor_pattern: Pattern
+    wall_pattern: Pattern
+    floor: Color
+    wall: Color
+    fixtures: Color
+    obstacles: tuple[Color, ...]
+    """One for each box of the catalogue."""
+    dolly: Color
+    light: Light
+    camera_noise: float
+    """Standard deviation of a pixel, grey levels."""
+    camera_exposure: float
 
 
-def draw_appearance(rng: np.random.Generator, boxes: int) -> Appearance:
-    """A random look for a scene with that many boxes; none of them is as blue as the dolly."""
+def look_ranges(config: RandomizationConfig, cell: int) -> LookRanges:
+    """The ranges of a room by its index: each arena has its own."""
+    if cell < len(CELLS):
+        return config.training
+    return getattr(config, ARENAS[cell - len(CELLS)].name)  # type: ignore[no-any-return]
 
-    def muted() -> Color:
-        r, g, b = rng.uniform(0.35, 1.0, 3)
-        return float(r), float(g), float(min(b, 0.5 * (r + g))), 1.0
 
+def draw_appearance(rng: np.random.Generator, config: RandomizationConfig, cell: int) -> Appearance:
+    """A random look; fixed quantities are drawn all the same, so that the others stay as they were."""
+    ranges = look_ranges(config, cell)
+
+    def is_fixed(name: str) -> bool:
+        return name in config.fixed or "all" in config.fixed
+
+    def pattern(name: str) -> Pattern:
+        choices: tuple[Pattern, ...] = getattr(ranges, name)
+        drawn = int(rng.integers(len(choices)))
+        return choices[0] if is_fixed(name) else choices[drawn]
+
+    def value(name: str) -> float:
+        low, high = getattr(ranges, name)
+        drawn = rng.uniform(low, high)
+        return (low + high) / 2 if is_fixed(name) else float(drawn)
+
+    def tint(name: str) -> Color:
+        r, g, b = value(name), value(name), value(name)
+        return r, g, min(b, (r + g) / 2), 1.0  # never as blue as the dolly
+
+    azimuth, elevation = math.radians(value("light_azimuth")), math.radians(value("light_elevation"))
+    flat = math.cos(elevation)
     return Appearance(
-        floor_texture=int(rng.integers(len(PATTERNS))),
-        wall_texture=int(rng.integers(len(PATTERNS))),
-        floor=muted(),
-        wall=muted(),
-        boxes=tuple(muted() for _ in range(boxes)),
-        light=Light(
-            direction=(float(rng.uniform(-5, 5)), float(rng.uniform(-5, 5)), float(rng.uniform(3, 8))),
-            color=tuple(float(c) for c in rng.uniform(0.85, 1.0, 3)),  # type: ignore[arg-type]
-            ambient=float(rng.uniform(0.45, 0.7)),
-            diffuse=float(rng.uniform(0.3, 0.6)),
+        floor_pattern=pattern("floor_pattern"),
+        wall_pattern=pattern("wall_pattern"),
+        floor=tint("floor_tone"),
+        wall=tint("wall_tone"),
+        fixtures=tint("box_tone"),
+        obstacles=tuple(tint("box_tone") for _ in range(CATALOGUE_SIZE)),
+        dolly=(
+            *colorsys.hsv_to_rgb(value("dolly_hue") / 360, value("dolly_saturation"), value("dolly_value")),
+            1.0,
         ),
+        light=Light(
+            (-math.sin(azimuth) * flat, math.cos(azimuth) * flat, math.sin(elevation)),
+            (value("light_color"), value("light_color"), value("light_color")),
+            value("light_ambient"),
+            value("light_diffuse"),
+        ),
+        camera_noise=value("camera_noise"),
+        camera_exposure=value("camera_exposure"),
     )
-
-
-def _patterns() -> list[NDArray[np.float64]]:
-    """Grey patterns in [0, 1], (64, 64) each, that tile seamlessly."""
-    rng = np.random.default_rng(0)  # the bank is the same everywhere; episodes differ in choice and tint
-    y, x = np.mgrid[0:TEXTURE_SIZE, 0:TEXTURE_SIZE] / TEXTURE_SIZE
-
-    def smooth(cells: int) -> NDArray[np.float64]:
-        spectrum = np.fft.rfft2(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)))
-        fy = np.fft.fftfreq(TEXTURE_SIZE)[:, None] * TEXTURE_SIZE
-        fx = np.fft.rfftfreq(TEXTURE_SIZE)[None, :] * TEXTURE_SIZE
-        noise = np.fft.irfft2(spectrum * np.exp(-(fx**2 + fy**2) / cells**2), s=x.shape)
-        return np.asarray((noise - noise.min()) / np.ptp(noise))
-
-    grain = rng.uniform(0.85, 1.0, x.shape)
-    return [
-        np.full_like(x, 0.95),
-        grain,
-        np.where((x < 0.03) | (y < 0.03), 0.6, 0.95) * grain,  # slabs
-        np.where((np.floor(x * 2) + np.floor(y * 2)) % 2 == 0, 0.65, 1.0),  # checkers
-        np.where(x % 0.25 < 0.125, 0.75, 1.0),  # upright stripes
-        np.where(y % 0.25 < 0.03, 0.6, 0.95) * grain,  # planks
-        np.where((y % 0.25 < 0.02) | ((x + 0.25 * (np.floor(y * 4) % 2)) % 0.5 < 0.02), 0.65, 0.95),  # bricks
-        0.6 + 0.4 * smooth(3),
-        0.6 + 0.4 * smooth(10),
-        np.where(y < 0.3, 0.6, 1.0),  # a band
-    ]
-
-
-PATTERNS = _patterns()
-
-
-def load_textures(bullet: Any) -> list[int]:
-    """Loads the bank into a pybullet client; returns the texture ids."""
-    ids = []
-    with tempfile.TemporaryDirectory() as folder:
-        for index, pattern in enumerate(PATTERNS):
-            pixels = np.repeat((255 * pattern).astype(np.uint8)[..., None], 3, axis=2)
-            path = Path(folder) / f"{index}.png"
-            Image.fromarray(pixels).save(path)
-            ids.append(bullet.loadTexture(str(path)))
-    return ids

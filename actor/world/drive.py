@@ -2,39 +2,54 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-from common.config import RobotConfig
-from common.geometry import SE2, wrap
+import numpy as np
+
+from common.geometry import SE2, Array
+from common.world_config import RobotConfig
 
 
-@dataclass(slots=True)
-class DifferentialDrive:
-    """Wheel speeds (m/s) of a robot that turns about the middle of its axle, its centre."""
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """N substeps, (N,) each: x, y in m, yaw in rad (not wrapped), wheel speeds in m/s."""
 
-    config: RobotConfig
-    left: float = 0.0
-    right: float = 0.0
+    x: Array
+    y: Array
+    yaw: Array
+    left: Array
+    right: Array
 
-    @property
-    def speed(self) -> float:
-        """Measured forward speed, m/s."""
-        return (self.left + self.right) / 2
 
-    def targets(self, v: float, w: float) -> tuple[float, float]:
-        """Wheel speeds for v (m/s) and w (rad/s), slowed down together when one would exceed the limit."""
-        half = w * self.config.track / 2
-        fastest = max(abs(v - half), abs(v + half))
-        scale = min(1.0, self.config.max_speed / fastest) if fastest > 0 else 1.0
-        return (v - half) * scale, (v + half) * scale
+def wheel_targets(config: RobotConfig, v: float, w: float) -> tuple[float, float]:
+    """Wheel speeds for v (m/s) and w (rad/s), slowed down together when one would exceed the limit."""
+    half = w * config.track / 2
+    fastest = max(abs(v - half), abs(v + half))
+    scale = min(1.0, config.max_speed / fastest) if fastest > 0 else 1.0
+    return (v - half) * scale, (v + half) * scale
 
-    def advance(self, pose: SE2, targets: tuple[float, float], dt: float) -> SE2:
-        """The pose after `dt` s; wheel speeds move towards `targets`."""
-        limit = self.config.wheel_acceleration * dt
-        self.left += min(max(targets[0] - self.left, -limit), limit)
-        self.right += min(max(targets[1] - self.right, -limit), limit)
-        turn = (self.right - self.left) / self.config.track * dt
-        middle = pose.yaw + turn / 2
-        step = self.speed * dt
-        return SE2(pose.x - step * math.sin(middle), pose.y + step * math.cos(middle), wrap(pose.yaw + turn))
+
+def advance(
+    config: RobotConfig,
+    pose: SE2,
+    speeds: tuple[float, float],
+    targets: tuple[float, float],
+    dt: float,
+    substeps: int,
+) -> Motion:
+    """The next `substeps` of `dt` s from a pose and wheel speeds (left, right), which approach `targets`.
+
+    The robot turns about the middle of its axle, its centre.
+    """
+    change = config.wheel_acceleration * dt * np.arange(1, substeps + 1)
+    left, right = (
+        np.minimum(speed + change, target) if target > speed else np.maximum(speed - change, target)
+        for speed, target in zip(speeds, targets, strict=True)
+    )
+    turns = (right - left) * (dt / config.track)
+    yaw = pose.yaw + turns.cumsum()
+    middle = yaw - turns / 2
+    steps = (left + right) * (dt / 2)
+    x = pose.x - (steps * np.sin(middle)).cumsum()
+    y = pose.y + (steps * np.cos(middle)).cumsum()
+    return Motion(x, y, yaw, left, right)

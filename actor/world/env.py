@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from actor.world.views import birds_eye
+from actor.world.views import VIEWS
 from actor.world.world import DockingWorld, Sensed
+from common.cells import CELLS
 from common.config import Config, resolve
 from common.observation import ACTION_SIZE, HISTORY, Columns, ObservationLayout, observe
-from common.tasks import CELLS, Task, random_task
+from common.tasks import Task, random_task
 
 Observed = dict[str, NDArray[Any]]
 
@@ -27,14 +28,20 @@ class DockingEnv(gymnasium.Env[Observed, NDArray[np.float32]]):
     recent, oldest first; `lidar` (2 * beams,) float32 in [0, 1].
 
     `reset(options={"task": Task})` sets the start, `{"cell": 3}` the cell; otherwise the seed decides both.
+    `render()` gives the scene from above or, with `view="chase"`, from behind the robot.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 6}  # noqa: RUF012
 
-    def __init__(self, config: Config | None = None, render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        render_mode: str | None = None,
+        view: Literal["birds_eye", "chase"] = "birds_eye",
+    ) -> None:
         config = config or resolve()
         raw = config.model_copy(update={"encoder": config.encoder.model_copy(update={"end_to_end": True})})
-        self.config, self.render_mode = config, render_mode
+        self.config, self.render_mode, self._view = config, render_mode, VIEWS[view]
         self._layout = ObservationLayout.of(raw)
         steps = config.world.max_episode_steps
         self._world = DockingWorld(config.world, steps)
@@ -70,8 +77,8 @@ class DockingEnv(gymnasium.Env[Observed, NDArray[np.float32]]):
         return self._observe(t + 1), float(reward), ending is not None and not truncated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The scene from above, (480, 480, 3) uint8, in render mode `rgb_array`."""
-        return birds_eye(self._world, 480) if self.render_mode == "rgb_array" else None
+        """The scene, (480, 480, 3) uint8, in render mode `rgb_array`."""
+        return self._view(self._world, 480) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Frees the physics client."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from common.config import RewardConfig
 from common.messages import Ending
+from common.world_config import RewardConfig
 
 
 def reward(config: RewardConfig, speed: float, ending: Ending | None) -> float:

@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from common.bus import Keys, ask, check_endpoint, open_client, open_hub
+from common.cells import check_cell
 from common.errors import UsageError
 from common.messages import Proposals, TaskQuery
-from common.tasks import check_cell
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
 from deploy.cli.processes import say_waiting

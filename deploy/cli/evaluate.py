@@ -1,26 +1,40 @@
-"""`navaclq evaluate`: a policy on a fixed suite of tasks."""
+"""`navaclq evaluate`: a policy on a fixed suite, or on the grid test, with confidence intervals."""
 
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from common.config import resolve
+from common.config import Config, resolve
 from common.errors import UsageError
+from common.messages import Ending
+from common.tasks import GRID_HEADINGS, PlacedStart, Task, grid
 from common.tasks import suite as suite_tasks
 from deploy.cli import options
 
+if TYPE_CHECKING:
+    from actor.evaluation import Scripted
 
-def find_policy(path: Path) -> Path:
-    """The policy folder meant by `path`: itself, or of a run its newest snapshot."""
+REPEATS = {"quick": 1, "paper": 9}
+
+
+def find_policy(name: str, config: Config) -> Path | Scripted:
+    """The policy meant by `name`: a folder, of a run its newest snapshot, or b0 in the world of `config`."""
+    if name == "b0":
+        from actor.evaluation import Scripted
+
+        return Scripted(config)
+    path = Path(name)
     if not path.exists():
-        raise UsageError(f"policy {path} does not exist; give a run directory, a checkpoint or a snapshot")
+        raise UsageError(
+            f"policy {path} does not exist; give a run directory, a checkpoint, a snapshot, or b0"
+        )
     if not (path / "run.json").exists():
         return path
     found = [p for p in (path / "snapshots").glob("*") if p.suffix != ".part"]
@@ -29,51 +43,101 @@ def find_policy(path: Path) -> Path:
     return max(found, key=lambda snapshot: snapshot.stat().st_mtime_ns)
 
 
-def run_suite(
-    policy: Path, suite: str, processes: int, greedy: bool, seed: int, label: str
-) -> dict[str, float]:
-    """Rates of the endings of a policy on a suite, with a progress bar on stderr."""
-    from actor.evaluation import evaluate, rates
-    from common.policy_files import load_policy
+def run_tasks(
+    policy: Path | Scripted,
+    tasks: list[Task],
+    processes: int | None,
+    label: str,
+    greedy: bool = True,
+    seed: int = 0,
+    max_steps: int = 0,
+) -> list[Ending]:
+    """How a policy ends each task, with a progress bar on stderr; by default one process per core."""
+    from actor.evaluation import evaluate
 
-    config = load_policy(policy)[0]
-    tasks = suite_tasks(suite, config)
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        row = bar.add_task(f"{label} on {suite}", total=len(tasks))
-        endings = evaluate(
-            policy, tasks, processes, greedy, seed, lambda done: bar.update(row, completed=done)
+        row = bar.add_task(label, total=len(tasks))
+        return evaluate(
+            policy,
+            tasks,
+            processes or os.cpu_count() or 1,
+            greedy,
+            seed,
+            lambda done: bar.update(row, completed=done),
+            max_steps,
         )
-    return rates(endings)
+
+
+def summary(endings: list[Ending]) -> dict[str, Any]:
+    """Rates of the endings, and the 95% interval of success."""
+    from actor.evaluation import rates, wilson_interval
+
+    return {**rates(endings), "ci95": list(wilson_interval(endings.count("success"), len(endings)))}
+
+
+def by_heading(tasks: list[Task], endings: list[Ending]) -> dict[str, Any]:
+    """Summaries of a grid test: of every heading, inside the training range (up to 90 deg) and outside it."""
+    groups: dict[str, list[Ending]] = {str(heading): [] for heading in GRID_HEADINGS}
+    for task, ending in zip(tasks, endings, strict=True):
+        assert isinstance(task.start, PlacedStart)
+        groups[str(round(task.start.yaw))].append(ending)
+    parts = {True: list[Ending](), False: list[Ending]()}
+    for heading, found in groups.items():
+        parts[abs(int(heading)) <= 90] += found
+    return {
+        "headings": {heading: summary(found) for heading, found in groups.items()},
+        "inside": summary(parts[True]),
+        "outside": summary(parts[False]),
+    }
 
 
 def evaluate(
-    policy: Annotated[Path, typer.Argument(help="Run directory, checkpoint or snapshot.")],
+    policy: Annotated[
+        str, typer.Argument(help="Run directory, checkpoint, snapshot, or b0: the scripted controller.")
+    ],
     suite: Annotated[
         str, typer.Option(help="short: 100 near, straight starts; train: 400 of the full distribution.")
     ] = "train",
+    grid_test: Annotated[
+        Literal["quick", "paper"] | None,
+        typer.Option(
+            "--grid", help="Instead of a suite the grid test: quick 968 starts, paper 9 times each."
+        ),
+    ] = None,
+    arena: Annotated[
+        str, typer.Option(help="Where the grid is: validation, or test for final results.")
+    ] = "validation",
     sampled: Annotated[
         bool, typer.Option("--sampled", help="Sample actions, as in training, instead of the greedy ones.")
     ] = False,
-    processes: Annotated[
-        int | None, typer.Option(min=1, max=64, help="Worker processes; default: one per core.")
-    ] = None,
+    processes: options.Processes = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of sampled actions.")] = 0,
     as_json: options.Json = False,
 ) -> None:
-    """Drive a policy through a fixed suite of seeded tasks and count how the episodes end."""
-    from actor.evaluation import wilson_interval
-
-    suite_tasks(suite, resolve())
-    folder = find_policy(policy)
-    workers = processes or os.cpu_count() or 1
-    found = run_suite(folder, suite, workers, not sampled, seed, str(folder))
-    size = len(suite_tasks(suite, resolve()))
-    low, high = wilson_interval(round(found["success"] * size), size)
-    result: dict[str, Any] = {"policy": str(folder), "suite": suite, "seed": seed, "episodes": size}
-    result |= {"sampled": sampled, "all": {**found, "ci95": [low, high]}}
+    """Drive a policy through fixed, seeded tasks and count how the episodes end."""
+    config = resolve()
+    tasks = grid(arena, REPEATS[grid_test]) if grid_test else suite_tasks(suite, config)
+    name = f"grid-{grid_test} in {arena}" if grid_test else suite
+    found = find_policy(policy, config)
+    label = policy if policy == "b0" else str(found)
+    endings = run_tasks(found, tasks, processes, f"{label} on {name}", not sampled, seed)
+    result: dict[str, Any] = {"policy": label, "suite": name, "seed": seed, "episodes": len(tasks)}
+    result |= {"sampled": sampled, "all": summary(endings)}
+    if grid_test:
+        result |= {"arena": arena, **by_heading(tasks, endings)}
     if as_json:
         options.print_json(result)
-    else:
-        text = ", ".join(f"{name.replace('_', ' ')} {100 * rate:.1f}%" for name, rate in found.items())
-        interval = f"95% interval of success {100 * low:.1f} to {100 * high:.1f}%"
-        sys.stdout.write(f"{folder} on suite {suite} ({size} episodes): {text}; {interval}\n")
+        return
+    sys.stdout.write(f"{label} on {name}, {len(tasks)} episodes\n")
+    rows = {"all": result["all"]}
+    if grid_test:
+        rows |= {"inside": result["inside"], "outside": result["outside"], **result["headings"]}
+    for row, rates in rows.items():
+        low, high = rates["ci95"]
+        others = ", ".join(
+            f"{k.replace('_', ' ')} {100 * rates[k]:.1f}%" for k in rates if k not in ("success", "ci95")
+        )
+        sys.stdout.write(
+            f"{row:>8}: success {100 * rates['success']:.1f}% "
+            f"(95% interval {100 * low:.1f} to {100 * high:.1f}%), {others}\n"
+        )

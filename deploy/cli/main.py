@@ -10,7 +10,7 @@ from typer.exceptions import TyperException
 from common.bus import NoAnswerError, RefusedError
 from common.errors import UsageError
 from common.messages import MessageError
-from deploy.cli import config, curriculum, doctor, evaluate, processes, train, world
+from deploy.cli import bench, config, curriculum, doctor, evaluate, processes, train, world
 
 app = typer.Typer(
     name="navaclq",
@@ -26,6 +26,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("doctor")(doctor.doctor)
 app.add_typer(curriculum.app, name="curriculum")
 app.add_typer(world.app, name="world")
+app.add_typer(bench.app, name="bench")
 app.add_typer(config.app, name="config")
 
 

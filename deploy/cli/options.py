@@ -9,9 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from common.cells import arena_index, check_cell
 from common.config import Config, resolve
 from common.errors import UsageError
-from common.tasks import check_cell
+from common.tasks import DollyShift, PlacedStart, Task
+from common.world_config import StartRanges
 
 Run = Annotated[Path, typer.Option("--run", help="Run directory; made when it does not exist, else resumed.")]
 Preset = Annotated[str | None, typer.Option(help="Starting configuration: fast (default), paper or smoke.")]
@@ -30,8 +32,24 @@ Insecure = Annotated[
     bool, typer.Option("--insecure", help="Allow plain TCP beyond loopback: anybody on the way can read it.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, max=64, help="Worker processes; default: one per core.")
+]
 Minutes = Annotated[
     float | None, typer.Option(min=0.01, help="Minutes from the first environment step to the last update.")
+]
+
+Room = Annotated[
+    str, typer.Option("--cell", help="Training cell 0 to 8, or the arena `validation` or `test`.")
+]
+TaskSeed = Annotated[int, typer.Option("--seed", min=0, max=2**53 - 1, help="Seed of the task.")]
+Place = Annotated[
+    str | None,
+    typer.Option(help="Start at X,Y,YAW in the dolly's frame (m, m, degrees; Y < 0 is in front of it)."),
+]
+Shift = Annotated[
+    str | None,
+    typer.Option(help="Move the dolly after STEP control steps by X,Y,YAW (m, m, degrees): STEP,X,Y,YAW."),
 ]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -42,6 +60,28 @@ def configuration(
 ) -> Config:
     """The configuration that the common options ask for."""
     return resolve(preset, file, tuple(settings or ()), variant, seed)
+
+
+def make_task(config: Config, room: str, seed: int, place: str | None, shift: str | None) -> Task:
+    """The task that the options of `world preview` and `world record` ask for."""
+    start: StartRanges | PlacedStart = config.world.start
+    try:
+        if place is not None:
+            x, y, yaw = (float(part) for part in place.split(","))
+            start = PlacedStart(x=x, y=y, yaw=yaw)
+    except ValueError:  # pydantic's is one
+        raise UsageError(f"--place {place!r} must be X,Y,YAW within 20 m and 180 degrees") from None
+    moves = None
+    try:
+        if shift is not None:
+            step, x, y, yaw = (float(part) for part in shift.split(","))
+            moves = DollyShift(step=int(step), x=x, y=y, yaw=yaw)
+    except ValueError:
+        raise UsageError(
+            f"--shift {shift!r} must be STEP,X,Y,YAW: from step 1 on, within 10 m and 180 degrees"
+        ) from None
+    cell = check_cell(int(room)) if room.isdecimal() else arena_index(room)
+    return Task(cell=cell, seed=seed, start=start, shift=moves)
 
 
 def parse_cells(text: str) -> list[int]:

@@ -17,7 +17,7 @@ from common.errors import UsageError
 from common.tasks import suite as suite_tasks
 from common.telemetry import exit_on_signals
 from deploy.cli import options
-from deploy.cli.evaluate import run_suite
+from deploy.cli.evaluate import run_tasks
 from deploy.launcher import Child, Supervisor, free_port
 from deploy.screen import Monitor, Screen
 
@@ -152,13 +152,18 @@ def _summary(run: Path, load: float) -> dict[str, Any]:
 
 def _compare(run: Path, suite: str, seed: int) -> dict[str, Any]:
     """Untrained against trained policy on a suite, greedy; outside the training's clock."""
-    workers = os.cpu_count() or 1
+    from actor.evaluation import rates
+
     policies = {"before": run / "snapshots" / "initial", "after": run / "snapshots" / "final"}
     if missing := [path for path in policies.values() if not path.exists()]:
         raise UsageError(f"{missing[0]} is missing: nothing to evaluate")
     config = parse((run / "config.toml").read_text("utf-8"))
-    found = {name: run_suite(path, suite, workers, True, seed, name) for name, path in policies.items()}
-    return {"suite": suite, "episodes": len(suite_tasks(suite, config)), **found}
+    tasks = suite_tasks(suite, config)
+    found = {
+        name: rates(run_tasks(path, tasks, None, f"{name} on {suite}", seed=seed))
+        for name, path in policies.items()
+    }
+    return {"suite": suite, "episodes": len(tasks), **found}
 
 
 def _print_summary(result: dict[str, Any], run: Path) -> None:

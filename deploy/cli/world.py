@@ -1,4 +1,4 @@
-"""`navaclq world`: looking at the docking world."""
+"""`navaclq world`: looking at the docking world, recording drives in it, checking its tasks."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from rich.console import Console
+from rich.progress import Progress
 
+from common.cells import ARENAS, CELLS
 from common.errors import UsageError
-from common.tasks import Task, check_cell
 from deploy.cli import options
 
 app = typer.Typer(help="Look at the docking world.", no_args_is_help=True)
@@ -18,36 +20,138 @@ app = typer.Typer(help="Look at the docking world.", no_args_is_help=True)
 
 @app.callback()
 def _group() -> None:
-    """Look at the docking world."""
+    """Look at the docking world, record drives, check that its tasks can be solved."""
+
+
+def _check_file(option: str, file: Path, *suffixes: str) -> None:
+    """Raises UsageError unless `file` can be written and says what it is."""
+    if file.suffix.lower() not in suffixes:
+        raise UsageError(f"{option} {file} must end in {' or '.join(suffixes)}")
+    if not file.resolve().parent.is_dir():
+        raise UsageError(f"{option} {file}: the folder {file.resolve().parent} does not exist")
 
 
 @app.command()
 def preview(
-    out: Annotated[Path, typer.Option(help="PNG file to write.")],
-    cell: Annotated[int, typer.Option(help="Training cell, 0 to 8.")] = 0,
-    seed: Annotated[int, typer.Option(min=0, max=2**53 - 1, help="Seed of the task.")] = 0,
+    out: Annotated[Path, typer.Option(help="PNG or JPEG file to write.")],
+    cell: Annotated[
+        str,
+        typer.Option(help="Training cell 0 to 8, the arena `validation` or `test`, or `all` side by side."),
+    ] = "0",
+    seed: options.TaskSeed = 0,
+    place: options.Place = None,
+    shift: options.Shift = None,
     steps: Annotated[int, typer.Option(min=0, max=1000, help="Random control steps to drive first.")] = 0,
     config: options.ConfigFile = None,
     settings: options.Settings = None,
 ) -> None:
     """Draw a start: from above with LiDAR beams, from behind, through the camera, with the task's numbers."""
-    check_cell(cell)
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"--out {out} must end in .png")
-    if not out.resolve().parent.is_dir():
-        raise UsageError(f"--out {out}: the folder {out.resolve().parent} does not exist")
+    _check_file("--out", out, ".png", ".jpg")
     resolved = options.configuration(None, None, config, settings, None)
+    rooms = (
+        [str(i) for i in range(len(CELLS))] + [arena.name for arena in ARENAS] if cell == "all" else [cell]
+    )
+    tasks = [options.make_task(resolved, room, seed, place, shift) for room in rooms]
+    from actor.world.views import gallery
     from actor.world.views import preview as draw
     from actor.world.world import DockingWorld
 
     world = DockingWorld(resolved.world, max_steps=steps + 1)
     try:
-        world.reset(Task(cell=cell, seed=seed, start=resolved.world.start))
+        if cell == "all":
+            gallery(world, tasks).save(out)
+            sys.stdout.write(f"{out}\n")
+            return
+        sensed = world.reset(tasks[0])
         rng = np.random.default_rng(seed)
         for _ in range(steps):
-            if world.step(rng.uniform(-1, 1, 2)).ending:
+            step = world.step(rng.uniform(-1, 1, 2))
+            sensed = step.sensed
+            if step.ending:
                 break
-        draw(world).save(out)
+        draw(world, sensed).save(out)
     finally:
         world.close()
     sys.stdout.write(f"{out}\n")
+
+
+@app.command()
+def record(
+    policy: Annotated[str, typer.Option(help="Run directory, checkpoint, snapshot, or b0 (scripted).")],
+    out: Annotated[Path, typer.Option(help="MP4 file to write.")],
+    cell: options.Room = "0",
+    seed: options.TaskSeed = 0,
+    place: options.Place = None,
+    shift: options.Shift = None,
+    sampled: Annotated[
+        bool, typer.Option("--sampled", help="Sample actions, as in training, instead of the greedy ones.")
+    ] = False,
+    still: Annotated[Path | None, typer.Option(help="PNG file for one frame.")] = None,
+    still_at: Annotated[float, typer.Option(min=0, max=1, help="Where in the drive, from 0 to 1.")] = 0.5,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+) -> None:
+    """Film one drive: camera, bird's eye with LiDAR and trail, chase view, action, reward; in real time."""
+    _check_file("--out", out, ".mp4")
+    if still:
+        _check_file("--still", still, ".png")
+    resolved = options.configuration(None, None, config, settings, None)
+    task = options.make_task(resolved, cell, seed, place, shift)
+    from actor.evaluation import load_driver
+    from actor.recording import drive, write_video
+    from deploy.cli.evaluate import find_policy
+
+    rollout, actor = load_driver(find_policy(policy, resolved), not sampled, 1, 0)
+    try:
+        drawn = list(drive(rollout, actor, task))
+    finally:
+        rollout.close()
+    frames = [frame for frame, _ in drawn]
+    count = write_video(out, iter(frames), resolved.world.control_period)
+    if still:
+        frames[round(still_at * (count - 1))].save(still)
+    sys.stdout.write(f"{out}: {count} frames, {drawn[-1][1]}\n")
+
+
+@app.command()
+def check(
+    tasks: Annotated[int, typer.Option(min=1, help="Random tasks for each training cell.")] = 1000,
+    solve: Annotated[
+        int, typer.Option(min=0, help="Random training starts that the scripted controller must dock from.")
+    ] = 0,
+    processes: options.Processes = None,
+    out: Annotated[Path | None, typer.Option(help="Markdown file for the table.")] = None,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+) -> None:
+    """Draw random tasks of every training cell, show their geometric properties, and drive some of them."""
+    if out:
+        _check_file("--out", out, ".md")
+    resolved = options.configuration(None, None, config, settings, seed)
+    from deploy.cli.evaluate import run_tasks
+    from deploy.task_table import as_markdown, properties_of_cells, starts_to_solve
+
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        row = bar.add_task("tasks", total=9 * tasks)
+        table = properties_of_cells(resolved, tasks, lambda done: bar.update(row, completed=done))
+    result = {"seed": resolved.seed, "tasks_per_cell": tasks, "cells": table}
+    text = as_markdown(table)
+    if solve:
+        starts, limit = starts_to_solve(resolved, solve), resolved.world.max_episode_steps
+        from actor.evaluation import Scripted, rates
+
+        found = rates(run_tasks(Scripted(resolved), starts, processes, "b0", max_steps=limit))
+        result["solved"] = {"tasks": solve, "max_steps": limit, **found}
+        text += (
+            f"\nThe scripted controller (b0), {solve} more such tasks, at most {limit} steps: "
+            + ", ".join(f"{name.replace('_', ' ')} {100 * rate:.1f}%" for name, rate in found.items())
+        )
+    text = text.rstrip() + "\n"
+    if out:
+        out.write_text(text, "utf-8")
+    if as_json:
+        options.print_json(result)
+    else:
+        sys.stdout.write(text)

@@ -1,0 +1,49 @@
+"""The result of a benchmark: rows, ratios (higher is better), what was skipped and where it ran."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One measured value."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(slots=True)
+class Report:
+    """All that one benchmark says, as `navaclq bench NAME --json` prints it."""
+
+    bench: str
+    rows: list[Row] = field(default_factory=list)
+    ratios: dict[str, float] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+
+    def add(self, name: str, value: float, unit: str) -> None:
+        """Appends a row."""
+        self.rows.append(Row(name, value, unit))
+
+    def to_json(self) -> dict[str, Any]:
+        """The report and the host, in numbers of four digits."""
+        host = {
+            "cores": os.cpu_count(),
+            "load_average": round(os.getloadavg()[0], 2),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+        }
+        rows = [asdict(row) | {"value": float(f"{row.value:.4g}")} for row in self.rows]
+        ratios = {name: round(value, 3) for name, value in self.ratios.items()}
+        return {"bench": self.bench, "rows": rows, "ratios": ratios, "skipped": self.skipped, "host": host}
+
+    def to_text(self) -> str:
+        """The same for people."""
+        lines = [f"{row.name:32} {row.value:10.4g} {row.unit}" for row in self.rows]
+        lines += [f"{name:32} {value:10.3f}" for name, value in self.ratios.items()]
+        return "\n".join([*lines, *(f"skipped: {reason}" for reason in self.skipped)]) + "\n"
