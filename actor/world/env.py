@@ -39,6 +39,8 @@ class DockingEnv(gymnasium.Env[Observed, NDArray[np.float32]]):
         render_mode: str | None = None,
         view: Literal["birds_eye", "chase"] = "birds_eye",
     ) -> None:
+        if view not in VIEWS:
+            raise ValueError(f"view {view!r} does not exist; choose one of {', '.join(VIEWS)}")
         config = config or resolve()
         raw = config.model_copy(update={"encoder": config.encoder.model_copy(update={"end_to_end": True})})
         self.config, self.render_mode, self._view = config, render_mode, VIEWS[view]

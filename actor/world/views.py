@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,8 @@ VIEWS: dict[str, Callable[[DockingWorld, int], Picture]] = {"birds_eye": birds_e
 
 def preview(world: DockingWorld, sensed: Sensed) -> Image.Image:
     """All views of a world with what it senses, and its task in numbers; (772, 990) pixels."""
-    facts = geometric_properties(world.task, world.scene)
+    now = replace(world.scene, robot=world.pose, dolly=world.dolly)
+    facts = geometric_properties(world.task, now)
     angle, approach = math.degrees(facts.relative_angle), math.degrees(facts.approach_angle)
     return _sheet(
         world,

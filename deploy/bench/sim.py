@@ -43,7 +43,7 @@ def bench_sim(
     """Measures for `rounds` rounds, then drives `soak` steps to see memory grow; `progress` hears rounds."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(config.seed)
-    world, gym, crew = DockingWorld(config.world, EPISODE), DockingEnv(config), _Crew(config, rng)
+    world, gym, crew = DockingWorld(config.world, EPISODE), _gym(config), _Crew(config, rng)
     encode, decide = _bare_networks(config)
     raw, full, wrapped, resets, actor, encoder, policy = (list[float]() for _ in range(7))
     for index in range(rounds + 1):  # the first warms up
@@ -107,6 +107,11 @@ def _drive(world: DockingWorld, task: Task, rng: np.random.Generator) -> tuple[f
             total += time.perf_counter() - began
             driven.append(before)
     return reset, total / len(driven), driven
+
+
+def _gym(config: Config) -> DockingEnv:
+    world = config.world.model_copy(update={"max_episode_steps": EPISODE})
+    return DockingEnv(config.model_copy(update={"world": world}))
 
 
 def _repeat(gym: DockingEnv, task: Task, driven: list[Driven]) -> float:

@@ -96,8 +96,11 @@ def evaluate(
         str, typer.Argument(help="Run directory, checkpoint, snapshot, or b0: the scripted controller.")
     ],
     suite: Annotated[
-        str, typer.Option(help="short: 100 near, straight starts; train: 400 of the full distribution.")
-    ] = "train",
+        str | None,
+        typer.Option(
+            help="short: 100 near, straight starts; train: 400 of the full distribution (the default)."
+        ),
+    ] = None,
     grid_test: Annotated[
         Literal["quick", "paper"] | None,
         typer.Option(
@@ -105,8 +108,9 @@ def evaluate(
         ),
     ] = None,
     arena: Annotated[
-        str, typer.Option(help="Where the grid is: validation, or test for final results.")
-    ] = "validation",
+        str | None,
+        typer.Option(help="Where the grid is: validation (the default), or test for final results."),
+    ] = None,
     sampled: Annotated[
         bool, typer.Option("--sampled", help="Sample actions, as in training, instead of the greedy ones.")
     ] = False,
@@ -116,8 +120,13 @@ def evaluate(
 ) -> None:
     """Drive a policy through fixed, seeded tasks and count how the episodes end."""
     config = resolve()
+    if grid_test and suite:
+        raise UsageError("--suite and --grid exclude each other; drop one of them")
+    if arena and not grid_test:
+        raise UsageError("--arena says where a grid is; add --grid quick or --grid paper")
+    suite, arena = suite or "train", arena or "validation"
     tasks = grid(arena, REPEATS[grid_test]) if grid_test else suite_tasks(suite, config)
-    name = f"grid-{grid_test} in {arena}" if grid_test else suite
+    name = f"grid-{grid_test}" if grid_test else suite
     found = find_policy(policy, config)
     label = policy if policy == "b0" else str(found)
     endings = run_tasks(found, tasks, processes, f"{label} on {name}", not sampled, seed)

@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
-from common.cells import arena_index, check_cell
+from common.cells import ARENAS, CELLS, check_cell
 from common.config import Config, resolve
 from common.errors import UsageError
 from common.tasks import DollyShift, PlacedStart, Task
-from common.world_config import StartRanges
+from common.world_config import StartRanges, WorldConfig
 
 Run = Annotated[Path, typer.Option("--run", help="Run directory; made when it does not exist, else resumed.")]
 Preset = Annotated[str | None, typer.Option(help="Starting configuration: fast (default), paper or smoke.")]
@@ -62,9 +62,9 @@ def configuration(
     return resolve(preset, file, tuple(settings or ()), variant, seed)
 
 
-def make_task(config: Config, room: str, seed: int, place: str | None, shift: str | None) -> Task:
+def make_task(world: WorldConfig, room: str, seed: int, place: str | None, shift: str | None) -> Task:
     """The task that the options of `world preview` and `world record` ask for."""
-    start: StartRanges | PlacedStart = config.world.start
+    start: StartRanges | PlacedStart = world.start
     try:
         if place is not None:
             x, y, yaw = (float(part) for part in place.split(","))
@@ -75,13 +75,15 @@ def make_task(config: Config, room: str, seed: int, place: str | None, shift: st
     try:
         if shift is not None:
             step, x, y, yaw = (float(part) for part in shift.split(","))
-            moves = DollyShift(step=int(step), x=x, y=y, yaw=yaw)
+            moves = DollyShift.model_validate({"step": step, "x": x, "y": y, "yaw": yaw})
     except ValueError:
         raise UsageError(
             f"--shift {shift!r} must be STEP,X,Y,YAW: from step 1 on, within 10 m and 180 degrees"
         ) from None
-    cell = check_cell(int(room)) if room.isdecimal() else arena_index(room)
-    return Task(cell=cell, seed=seed, start=start, shift=moves)
+    names = [*(str(cell) for cell in range(len(CELLS))), *(arena.name for arena in ARENAS)]
+    if room not in names:
+        raise UsageError(f"--cell {room!r} does not exist; choose one of {', '.join(names)}")
+    return Task(cell=names.index(room), seed=seed, start=start, shift=moves)
 
 
 def parse_cells(text: str) -> list[int]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -14,6 +15,9 @@ from rich.progress import Progress
 from common.cells import ARENAS, CELLS
 from common.errors import UsageError
 from deploy.cli import options
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 app = typer.Typer(help="Look at the docking world.", no_args_is_help=True)
 
@@ -27,6 +31,8 @@ def _check_file(option: str, file: Path, *suffixes: str) -> None:
     """Raises UsageError unless `file` can be written and says what it is."""
     if file.suffix.lower() not in suffixes:
         raise UsageError(f"{option} {file} must end in {' or '.join(suffixes)}")
+    if file.is_dir():
+        raise UsageError(f"{option} {file} is a folder; name a file")
     if not file.resolve().parent.is_dir():
         raise UsageError(f"{option} {file}: the folder {file.resolve().parent} does not exist")
 
@@ -47,11 +53,13 @@ def preview(
 ) -> None:
     """Draw a start: from above with LiDAR beams, from behind, through the camera, with the task's numbers."""
     _check_file("--out", out, ".png", ".jpg")
+    if cell == "all" and steps:
+        raise UsageError("--steps does not go with --cell all, which shows starts")
     resolved = options.configuration(None, None, config, settings, None)
     rooms = (
         [str(i) for i in range(len(CELLS))] + [arena.name for arena in ARENAS] if cell == "all" else [cell]
     )
-    tasks = [options.make_task(resolved, room, seed, place, shift) for room in rooms]
+    tasks = [options.make_task(resolved.world, room, seed, place, shift) for room in rooms]
     from actor.world.views import gallery
     from actor.world.views import preview as draw
     from actor.world.world import DockingWorld
@@ -87,30 +95,45 @@ def record(
         bool, typer.Option("--sampled", help="Sample actions, as in training, instead of the greedy ones.")
     ] = False,
     still: Annotated[Path | None, typer.Option(help="PNG file for one frame.")] = None,
-    still_at: Annotated[float, typer.Option(min=0, max=1, help="Where in the drive, from 0 to 1.")] = 0.5,
+    still_at: Annotated[float, typer.Option(min=0, help="Second of the drive that it shows.")] = 3.0,
     config: options.ConfigFile = None,
     settings: options.Settings = None,
 ) -> None:
-    """Film one drive: camera, bird's eye with LiDAR and trail, chase view, action, reward; in real time."""
+    """Film one drive: camera, bird's eye with LiDAR and trail, chase view, action, reward; in real time.
+
+    A trained policy drives in the world that it was trained in; --config and --set are for b0.
+    """
     _check_file("--out", out, ".mp4")
     if still:
         _check_file("--still", still, ".png")
+    if policy != "b0" and (config or settings):
+        raise UsageError("--config and --set go with --policy b0; a trained policy brings its own world")
     resolved = options.configuration(None, None, config, settings, None)
-    task = options.make_task(resolved, cell, seed, place, shift)
     from actor.evaluation import load_driver
     from actor.recording import drive, write_video
     from deploy.cli.evaluate import find_policy
 
     rollout, actor = load_driver(find_policy(policy, resolved), not sampled, 1, 0)
+    world = rollout.worlds[0].config
+    task = options.make_task(world, cell, seed, place, shift)
+    ending = None
+
+    def frames() -> Iterator[Image.Image]:
+        nonlocal ending
+        kept = None
+        for index, (frame, found) in enumerate(drive(rollout, actor, task)):
+            ending = found
+            if kept is None or index <= still_at / world.control_period:
+                kept = frame
+            yield frame
+        if still and kept:
+            kept.save(still)
+
     try:
-        drawn = list(drive(rollout, actor, task))
+        count = write_video(out, frames(), world.control_period)
     finally:
         rollout.close()
-    frames = [frame for frame, _ in drawn]
-    count = write_video(out, iter(frames), resolved.world.control_period)
-    if still:
-        frames[round(still_at * (count - 1))].save(still)
-    sys.stdout.write(f"{out}: {count} frames, {drawn[-1][1]}\n")
+    sys.stdout.write(f"{out}: {count} frames, {ending}\n")
 
 
 @app.command()
