@@ -36,10 +36,12 @@ class Scripted:
     config: Config
 
 
-def load_driver(policy: Path | Scripted, greedy: bool, slots: int, max_steps: int) -> tuple[Rollout, Actor]:
+def load_driver(
+    policy: Path | Scripted, greedy: bool, slots: int, max_steps: int | None = None
+) -> tuple[Rollout, Actor]:
     """Worlds and what drives in them; raises UsageError when `policy` is no policy, or damaged.
 
-    `max_steps` 0 stands for the configured length of an evaluation.
+    `max_steps` is by default the configured length of an evaluation.
     """
     config, tensors = (policy.config, {}) if isinstance(policy, Scripted) else load_policy(policy)
     encoder, limit = make_encoder(config), max_steps or config.world.max_evaluation_steps
@@ -61,7 +63,7 @@ def load_driver(policy: Path | Scripted, greedy: bool, slots: int, max_steps: in
 class Examiner:
     """Drives one policy through tasks, side by side in as many worlds as there are cells."""
 
-    def __init__(self, policy: Path | Scripted, greedy: bool, max_steps: int = 0) -> None:
+    def __init__(self, policy: Path | Scripted, greedy: bool, max_steps: int | None = None) -> None:
         torch.set_num_threads(1)
         self._rollout, self._actor = load_driver(policy, greedy, SLOTS, max_steps)
 
@@ -85,7 +87,7 @@ class Examiner:
 _examiner: Examiner | None = None
 
 
-def _start_worker(policy: Path | Scripted, greedy: bool, max_steps: int) -> None:
+def _start_worker(policy: Path | Scripted, greedy: bool, max_steps: int | None) -> None:
     global _examiner
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     _examiner = Examiner(policy, greedy, max_steps)
@@ -104,11 +106,11 @@ def evaluate(
     greedy: bool = True,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
-    max_steps: int = 0,
+    max_steps: int | None = None,
 ) -> list[Ending]:
     """How each task ended, in order; `progress` hears the number done. Raises UsageError for a bad policy.
 
-    `max_steps` 0 stands for the configured length of an evaluation.
+    `max_steps` is by default the configured length of an evaluation.
     """
     load_driver(policy, greedy, 0, max_steps)  # a bad one is refused here, not in a worker
     chunks = [(i, tasks[i : i + CHUNK], seed) for i in range(0, len(tasks), CHUNK)]

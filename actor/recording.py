@@ -36,7 +36,8 @@ def drive(rollout: Rollout, actor: Actor, task: Task) -> Iterator[tuple[Image.Im
 def write_video(path: Path, frames: Iterator[Image.Image], period: float) -> int:
     """Writes H.264 in MP4 at one frame each `period` s; returns the number of frames.
 
-    The file appears when it is complete. Raises UsageError when PyAV is not installed.
+    The file appears when it is complete. Raises UsageError when PyAV is not installed or the file cannot be
+    written.
     """
     try:
         import av
@@ -58,6 +59,8 @@ def write_video(path: Path, frames: Iterator[Image.Image], period: float) -> int
             if stream is not None:
                 container.mux(stream.encode())
         part.replace(path)
+    except OSError as error:  # PyAV's errors are among them
+        raise UsageError(f"cannot write {path}: {error.strerror}") from None
     finally:
         part.unlink(missing_ok=True)
     return count

@@ -278,13 +278,10 @@ def known_keys() -> list[str]:
     return walk(Config, "")
 
 
-def differing_key(
+def differing_keys(
     ours: BaseModel, theirs: BaseModel, within: tuple[str, ...] = ("",)
-) -> tuple[str, Any, Any] | None:
-    """The first dotted key, of those that begin with one of `within`, whose values differ, with both values.
-
-    None when all agree.
-    """
+) -> list[tuple[str, Any, Any]]:
+    """The dotted keys, of those that begin with one of `within`, whose values differ, with both values."""
 
     def walk(x: Any, y: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
         if isinstance(x, dict) and isinstance(y, dict):
@@ -294,7 +291,7 @@ def differing_key(
             yield path, x, y
 
     found = walk(ours.model_dump(), theirs.model_dump(), "")
-    return next((item for item in found if item[0].startswith(within)), None)
+    return [item for item in found if item[0].startswith(within)]
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -19,18 +19,22 @@ from safetensors.torch import save as save_tensors
 
 from common.bus import Keys, ask
 from common.cells import CELLS
-from common.config import Config, differing_key, override, parse
+from common.config import Config, differing_keys, override, parse
 from common.errors import UsageError
 from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
 from common.networks import Encoder, load_state, make_encoder, state_of
 from common.observation import HISTORY
 
-WORLD_VERSION = 2
-"""To be counted up by whoever changes how a scene is drawn, how the robot drives or what ends an episode."""
-
 AGREED = {
     "observation": ("world.camera", "world.lidar", "world.randomization", "encoder"),
-    "dynamics": ("world.robot", "world.dolly", "world.obstacles", "world.control_period", "world.substeps"),
+    "dynamics": (
+        "world.version",
+        "world.robot",
+        "world.dolly",
+        "world.obstacles",
+        "world.control_period",
+        "world.substeps",
+    ),
     "reward": ("world.reward", "world.max_episode_steps"),
 }
 """The settings behind each field of the digest; obstacles, because a task's scene follows from them."""
@@ -48,7 +52,7 @@ def digest(config: Config, encoder: bytes) -> dict[str, str]:
         field: [reduce(getitem, path.split("."), values) for path in paths] for field, paths in AGREED.items()
     }
     settings["observation"].append(HISTORY)
-    settings["dynamics"] += [WORLD_VERSION, repr(CELLS)]
+    settings["dynamics"].append(repr(CELLS))
     return {
         "protocol": str(SCHEMA_VERSION),
         "encoder": _short(values["encoder"]) if config.encoder.end_to_end else _short(encoder),
@@ -92,8 +96,8 @@ def accept_contract(contract: ContractReply, overrides: tuple[str, ...] = ()) ->
     mine = digest(ours, contract.encoder)
     for field, value in contract.digest.items():
         if mine.get(field) != value:
-            found = differing_key(ours, theirs, AGREED.get(field, (field,)))
-            detail = f": {found[0]} is {found[1]} here and {found[2]} there" if found else ""
+            found = differing_keys(ours, theirs, AGREED.get(field, (field,)))
+            detail = f": {found[0][0]} is {found[0][1]} here and {found[0][2]} there" if found else ""
             raise UsageError(f"refused by run {contract.run!r}: {field} differs{detail}")
     return ours
 

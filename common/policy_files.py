@@ -52,4 +52,8 @@ def load_policy(folder: Path) -> tuple[Config, dict[str, Tensor]]:
         raise UsageError(
             f"{folder} is no policy: a checkpoint folder with {CONFIG} and {NETWORKS} is expected"
         )
-    return parse((folder / CONFIG).read_text("utf-8")), load_tensors(folder / NETWORKS)
+    try:
+        config = parse((folder / CONFIG).read_text("utf-8"))
+    except UsageError as error:
+        raise UsageError(f"{folder} is a policy of another version of navaclq: {error}") from None
+    return config, load_tensors(folder / NETWORKS)

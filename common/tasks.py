@@ -63,13 +63,19 @@ class Task(Section):
     shift: DollyShift | None = None
 
 
-def _in_training_cell(task: Task) -> Task:
+FIRST_SUITE_SEED = 2**40
+"""Suites and grids have their seeds from here on, training below."""
+
+
+def _for_training(task: Task) -> Task:
     if task.cell >= len(CELLS):
         raise ValueError(f"cell {task.cell} is an arena, where nothing is trained")
+    if task.seed >= FIRST_SUITE_SEED:
+        raise ValueError(f"seed {task.seed} is an examination's, from which nothing is learned")
     return task
 
 
-TrainingTask = Annotated[Task, AfterValidator(_in_training_cell)]
+TrainingTask = Annotated[Task, AfterValidator(_for_training)]
 """What learner and curriculum accept."""
 
 
@@ -291,9 +297,12 @@ def suite(name: str, config: Config) -> list[Task]:
     """The tasks of a suite: `short`, 100 near and straight ones; `train`, 400 of the full distribution."""
     if name == "short":
         start = StartRanges(distance_max=2.0, yaw=20.0, bearing=4.0, dolly_yaw=4.0)
-        return [Task(cell=i % len(CELLS), seed=2**40 + i, start=start) for i in range(100)]
+        return [Task(cell=i % len(CELLS), seed=FIRST_SUITE_SEED + i, start=start) for i in range(100)]
     if name == "train":
-        return [Task(cell=i % len(CELLS), seed=2**41 + i, start=config.world.start) for i in range(400)]
+        return [
+            Task(cell=i % len(CELLS), seed=2 * FIRST_SUITE_SEED + i, start=config.world.start)
+            for i in range(400)
+        ]
     raise UsageError(f"suite {name!r} does not exist; choose one of {', '.join(SUITES)}")
 
 
@@ -308,7 +317,7 @@ def grid(arena: str, repeats: int, seed: int = 0) -> list[Task]:
         for row in range(11)
         for column in range(11)
     ]
-    first = 2**42 + seed * 2**20
+    first = 4 * FIRST_SUITE_SEED + seed * 2**20
     return [
         Task(cell=arena_index(arena), seed=first + index, start=start)
         for index, start in enumerate(starts * repeats)

@@ -229,14 +229,17 @@ class LookRanges(Section):
     camera_noise: Levels = (0.0, 3.0)
     """Standard deviation of a pixel, grey levels of 255."""
     camera_exposure: Range = (0.8, 1.2)
-    """Factor on all pixels."""
+    """Factor on the light; the white beyond the walls stays as it is."""
 
 
 class RandomizationConfig(Section):
     """Domain randomisation: ranges for the training cells and, apart from them, for the two arenas."""
 
     fixed: tuple[Literal["all", Quantity], ...] = ()
-    """Quantities that are held at the middle of their range, or at their first pattern."""
+    """Quantities that are held at the middle of their range, or at their first pattern; `all` of these.
+
+    Starts and obstacles are not among them: narrow their ranges instead.
+    """
     training: LookRanges = LookRanges()
     validation: LookRanges = LookRanges(
         floor_pattern=("diagonal",),
@@ -256,6 +259,8 @@ class RandomizationConfig(Section):
 class WorldConfig(Section):
     """The docking task, the same in every preset."""
 
+    version: Literal[2] = 2
+    """To be counted up by who changes how a scene is drawn, how the robot drives or what ends an episode."""
     control_period: Positive = 0.180
     """Seconds for which an action is held (section 3.3)."""
     substeps: Count = 36
@@ -271,3 +276,17 @@ class WorldConfig(Section):
     start: StartRanges = StartRanges()
     obstacles: ObstacleConfig = ObstacleConfig()
     randomization: RandomizationConfig = RandomizationConfig()
+
+    @model_validator(mode="after")
+    def _can_dock(self) -> WorldConfig:
+        robot, dolly = self.robot, self.dolly
+        if not robot.floor_gap < robot.height < dolly.underside:
+            raise ValueError("robot.floor_gap < robot.height < dolly.underside must hold")
+        if dolly.width - 2 * dolly.leg <= robot.width or dolly.length <= 2 * dolly.leg:
+            raise ValueError("the robot must fit between the dolly's legs")
+        if self.camera.near >= self.camera.far:
+            raise ValueError("camera.near < camera.far must hold")
+        for name, mount in robot.mounts:
+            if abs(mount.x) > robot.width / 2 + 0.01 or abs(mount.y) > robot.length / 2 + 0.01:
+                raise ValueError(f"robot.mounts.{name} lies outside the chassis; move it with x and y")
+        return self

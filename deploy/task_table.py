@@ -26,7 +26,7 @@ def properties_of_cells(
         for count in range(tasks):
             task = random_task(index, config, rng)
             rows.append(geometric_properties(task, build_scene(task, config.world)))
-            if progress and count % 100 == 99:
+            if progress:
                 progress(index * tasks + count + 1)
         quantiles = {
             name: np.quantile([_in_units(name, row) for row in rows], QUANTILES).round(3).tolist()

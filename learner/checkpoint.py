@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from common.config import Config, differing_key, parse
+from common.config import Config, differing_keys, parse
 from common.errors import UsageError
 from common.policy_files import CONFIG, NETWORKS, load_tensors, save_folder
 from learner.sac import SAC
@@ -52,8 +52,8 @@ class RunDirectory:
                 f"its run schema is {schema}, this version has {RUN_SCHEMA}"
             )
         config = parse(text)
-        if wanted is not None and (found := differing_key(wanted, config)):
-            key, asked, has = found
+        if wanted is not None and (found := differing_keys(wanted, config)):
+            key, asked, has = found[0]
             raise UsageError(
                 f"{self.folder} exists with {key} = {has}, asked was {asked}; "
                 "resume it without that setting or choose another --run"

@@ -9,10 +9,13 @@ import pytest
 
 from actor.baseline.docking import ScriptedController, approach
 from actor.baseline.planning import plan
+from actor.evaluation import Scripted, evaluate
+from actor.world.world import DockingWorld
 from common.cells import Box
 from common.config import Config
 from common.geometry import SE2, Rectangle, as_rows, separations, wrap
 from common.tasks import Obstacle, Scene, build_scene, dolly_sides, grid, random_task, surfaces
+from deploy.task_table import starts_to_solve
 
 CONFIG = Config()
 WORLD = CONFIG.world
@@ -181,3 +184,33 @@ def test_it_docks_from_a_sample_of_the_grid():
     tasks = grid("validation", 1)[::25]
     endings = [drive(build_scene(task, WORLD), 200, task.cell).ending for task in tasks]
     assert endings == ["docked"] * len(tasks)
+
+
+@pytest.mark.slow
+def test_it_docks_from_98_of_100_training_starts_in_the_simulator():
+    tasks, limit = starts_to_solve(CONFIG, 500), WORLD.max_episode_steps
+    endings = evaluate(Scripted(CONFIG), tasks, processes=2, max_steps=limit)
+    assert endings.count("success") >= 0.98 * len(tasks)
+
+
+@pytest.mark.slow
+def test_it_docks_from_97_of_100_grid_starts_in_the_simulator():
+    endings = evaluate(Scripted(CONFIG), grid("validation", 1), processes=2)
+    assert endings.count("success") >= 0.97 * 968
+
+
+def test_the_simulator_agrees_with_the_model_of_it_used_here():
+    """The same controller in pybullet: an ending after as many steps, at the same place."""
+    world = DockingWorld(WORLD, 100)
+    rng = np.random.default_rng(4)
+    for index in range(9):
+        task = random_task(index, CONFIG, rng)
+        world.place(task)
+        controller, ending = ScriptedController(WORLD, task.cell, world.scene), None
+        while ending is None:
+            _, ending = world.advance(controller.act(world.pose, world.dolly, world.speeds))
+        run = drive(build_scene(task, WORLD), 100, task.cell)
+        assert (ending, run.ending) == ("success", "docked")
+        assert world.steps == len(run.actions)
+        assert (world.pose.x, world.pose.y) == pytest.approx((run.poses[-1].x, run.poses[-1].y), abs=1e-6)
+    world.close()

@@ -9,11 +9,15 @@ import sys
 import av
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from actor.evaluation import Scripted
 from common.cells import CELLS, ROOMS
+from common.config import resolve
+from common.policy_files import CONFIG, NETWORKS, save_folder
 from common.tasks import GRID_HEADINGS, grid
-from deploy.cli.evaluate import by_heading, summary
+from deploy.cli.evaluate import by_heading, own_rules, summary
 from tests.test_cli import call
 
 PLAIN = ("world.obstacles.count_min=0", "world.obstacles.count_max=0", 'world.randomization.fixed=["all"]')
@@ -167,6 +171,8 @@ RECORD = ("world", "record", "--policy", "b0")
         (("world", "check", "--tasks", "0"), "--tasks"),
         (("evaluate", "nosuch"), "policy nosuch does not exist; give a run directory, a checkpoint"),
         (("evaluate", "b0", "--grid", "quick", "--suite", "short"), "--suite and --grid exclude each other"),
+        (("world", "preview", "--out", "/proc/x.png"), "/proc/x.png"),
+        (("world", "preview", "--out", "."), "must end in .png or .jpg"),
         (("evaluate", "b0", "--arena", "test"), "--arena says where a grid is; add --grid"),
         (
             ("world", "record", "--policy", ".", "--out", "x.mp4", "--set", "world.lidar.noise=1"),
@@ -204,7 +210,7 @@ def test_record_films_a_drive_and_keeps_one_frame(monkeypatch, capsys, tmp_path)
     assert code == 0, err
     with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert out == f"{video}: {len(frames)} frames, success\n"
+    assert out == f"{video}: {len(frames)} frames, {0.18 * len(frames):.1f} s, success\n"
     last = np.asarray(Image.open(still)).astype(int)
     assert abs(last - frames[-1]).mean() < abs(last - frames[0]).mean() / 2
     assert {path.name for path in tmp_path.iterdir()} == {"x.mp4", "x.png"}
@@ -309,19 +315,18 @@ def test_bench_sim_reports_rows_ratios_what_it_skipped_and_the_host():
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 1
     found = json.loads(done.stdout)
-    assert set(found) == {"bench", "rows", "ratios", "skipped", "host"}
+    assert set(found) == {"bench", "rows", "ratios", "quartiles", "skipped", "host"}
     assert found["bench"] == "sim"
     rows = {row["name"]: row for row in found["rows"]}
     assert len(rows) == len(found["rows"])
-    assert {
-        row: rows[row]["unit"] for row in ("environment", "raw_calls", "reset", "rss_with_eleven_worlds")
-    } == {
+    assert {row: rows[row]["unit"] for row in ("environment", "raw_calls", "reset", "rss_with_4_worlds")} == {
         "environment": "steps/s",
         "raw_calls": "steps/s",
         "reset": "ms",
-        "rss_with_eleven_worlds": "MB",
+        "rss_with_4_worlds": "MB",
     }
-    assert set(found["ratios"]) == {"env_over_raw", "actor_over_limit"}
+    assert set(found["ratios"]) == set(found["quartiles"])
+    assert {"env_over_raw", "gymnasium_over_raw", "actor_over_limit"} < set(found["ratios"])
     for value in (*(row["value"] for row in rows.values()), *found["ratios"].values()):
         assert math.isfinite(value)
         assert value > 0
@@ -329,3 +334,15 @@ def test_bench_sim_reports_rows_ratios_what_it_skipped_and_the_host():
     assert len(found["skipped"]) == 1
     assert set(found["host"]) == {"cores", "load_average", "machine", "python"}
     assert found["host"]["cores"] == os.cpu_count()
+
+
+def test_what_is_special_in_a_policys_world_stands_beside_its_result(tmp_path):
+    config = resolve("smoke", overrides=("world.reward.success_distance=3", "world.camera.size=32"))
+    save_folder(tmp_path / "policy", {CONFIG: config.to_toml()}, {NETWORKS: {"x": torch.zeros(1)}})
+    assert own_rules(tmp_path / "policy") == {
+        "world.max_episode_steps": 20,
+        "world.max_evaluation_steps": 20,
+        "world.camera.size": 32,
+        "world.reward.success_distance": 3.0,
+    }
+    assert own_rules(Scripted(resolve())) == {}

@@ -1,4 +1,5 @@
 import math
+import re
 import tomllib
 from functools import reduce
 from typing import get_args
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from common.config import (
     Config,
-    differing_key,
+    differing_keys,
     known_keys,
     override,
     parse,
@@ -434,12 +435,13 @@ def test_known_keys_are_dotted_and_hold_sections_and_leaves():
     assert set(TASK) | set(PAPER) <= set(keys)
 
 
-def test_differing_key_is_the_first_one_with_both_values():
+def test_differing_keys_come_with_both_values():
     ours, gamma = resolve(overrides=("world.robot.track=0.4", "sac.gamma=0.5")), Config().sac.gamma
-    assert differing_key(ours, Config()) == ("world.robot.track", 0.4, Config().world.robot.track)
-    assert differing_key(ours, Config(), ("sac", "replay")) == ("sac.gamma", 0.5, gamma)
-    assert differing_key(ours, Config(), ("replay",)) is None
-    assert differing_key(Config(), Config()) is None
+    track = ("world.robot.track", 0.4, Config().world.robot.track)
+    assert differing_keys(ours, Config()) == [track, ("sac.gamma", 0.5, gamma)]
+    assert differing_keys(ours, Config(), ("sac", "replay")) == [("sac.gamma", 0.5, gamma)]
+    assert differing_keys(ours, Config(), ("replay",)) == []
+    assert differing_keys(Config(), Config()) == []
 
 
 def test_ranges_refuse_what_means_nothing():
@@ -485,3 +487,22 @@ def test_override_of_one_coordinate_of_a_mount_leaves_the_others(mount):
     config = resolve(overrides=(f"world.robot.mounts.{mount}.z=0.25",))
     before = getattr(Config().world.robot.mounts, mount)
     assert getattr(config.world.robot.mounts, mount) == before.model_copy(update={"z": 0.25})
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("world.dolly.width=0.5", "fit between the dolly's legs"),
+        ("world.dolly.leg=0.5", "fit between the dolly's legs"),
+        ("world.dolly.length=0.05", "fit between the dolly's legs"),
+        ("world.robot.floor_gap=0.4", "floor_gap < robot.height < dolly.underside"),
+        ("world.robot.height=0.35", "floor_gap < robot.height < dolly.underside"),
+        ("world.camera.near=50", "camera.near < camera.far"),
+        ("world.robot.length=1.0", "robot.mounts.camera lies outside the chassis"),
+        ("world.robot.mounts.rear_lidar.x=0.5", "robot.mounts.rear_lidar lies outside the chassis"),
+        ("world.version=3", "world.version"),
+    ],
+)
+def test_a_world_in_which_nobody_can_dock_is_refused_by_its_reason(setting, said):
+    with pytest.raises(UsageError, match=re.escape(said)):
+        resolve(overrides=(setting,))

@@ -4,7 +4,6 @@ import torch
 from common.cells import CELLS
 from common.config import override, parse, resolve
 from common.contract import (
-    WORLD_VERSION,
     accept_contract,
     check_digest,
     contract_encoder,
@@ -86,10 +85,12 @@ def test_digest_ignores_what_each_process_may_choose(setting):
 
 def test_digest_reacts_to_the_training_cells_and_to_the_worlds_version(monkeypatch):
     before = digest(CONFIG, b"weights")
-    for name, value in (("CELLS", CELLS[:-1]), ("WORLD_VERSION", WORLD_VERSION + 1)):
-        with monkeypatch.context() as patch:
-            patch.setattr(f"common.contract.{name}", value)
-            after = digest(CONFIG, b"weights")
+    with monkeypatch.context() as patch:
+        patch.setattr("common.contract.CELLS", CELLS[:-1])
+        other_cells = digest(CONFIG, b"weights")
+    world = CONFIG.world.model_copy(update={"version": CONFIG.world.version + 1})
+    other_version = digest(CONFIG.model_copy(update={"world": world}), b"weights")
+    for after in (other_cells, other_version):
         assert {field for field in before if before[field] != after[field]} == {"dynamics"}
     assert digest(CONFIG, b"weights") == before
 

@@ -545,12 +545,7 @@ def test_shift_into_a_wall_or_to_where_none_can_dock_is_refused(shift, reason):
             ("world.dolly.width=30.0",),
             "cell 2 (pillars): the dolly stands in a wall or fixture",
         ),
-        (
-            2,
-            PlacedStart(x=0, y=-3, yaw=0),
-            ("world.robot.width=20.0",),
-            "cell 2 (pillars): the robot stands in a wall or fixture",
-        ),
+        (2, PlacedStart(x=0, y=-9, yaw=0), (), "cell 2 (pillars): the robot stands in a wall or fixture"),
         (
             1,
             PlacedStart(x=0, y=-3, yaw=0),

@@ -124,6 +124,24 @@ def test_nothing_is_passed_through_at_full_speed_backwards_into_a_leg_edge_on(wo
     assert world.pose.y - CONFIG.world.robot.length / 2 == pytest.approx(3.615, abs=0.006)
 
 
+def test_an_action_that_is_no_number_is_refused(world):
+    put(world, SE2())
+    for action in ((math.nan, 0.0), (0.0, math.nan)):
+        with pytest.raises(ValueError, match="is not a number"):
+            world.step(action)
+    assert world.steps == 0
+    assert world.pose == SE2()
+
+
+def test_actions_beyond_the_limits_are_cut(world):
+    put(world, SE2())
+    world.step((math.inf, -7.0))
+    far = world.pose
+    put(world, SE2())
+    world.step((1.0, -1.0))
+    assert world.pose == far
+
+
 def test_standing_still_runs_out_of_time_and_costs_the_slow_penalty(world):
     put(world, SE2())
     steps = drive(world, (0.0, 0.0), limit=100)

@@ -33,7 +33,7 @@ HEADINGS = np.arange(16) * (math.tau / 16)
 NUDGES = np.array([-0.12, 0.0, 0.12])
 LENGTHS = np.array([-2.4, -1.2, -0.6, -0.3, -0.15, 0.15, 0.3, 0.6, 1.2, 2.4])
 """Turns (rad, in the dolly's frame) and drives (m) of which the search makes its detours."""
-CELL = 0.25
+COARSE = 0.25
 """Where the robot can turn, the search takes poses nearer than this in x and y for one, m."""
 FINE = 0.2, 0.3
 """The same elsewhere, m, and for headings, rad."""
@@ -224,7 +224,7 @@ class _Search:
     def _keys(self, poses: Array) -> list[tuple[int, int, int]]:
         """What the search takes for one pose: headings count where the robot cannot turn."""
         tight = self._raster.gaps(poses[:, :2]) < self._turning
-        x, y = np.rint(poses[:, :2].T / np.where(tight, FINE[0], CELL)).astype(int)
+        x, y = np.rint(poses[:, :2].T / np.where(tight, FINE[0], COARSE)).astype(int)
         heading = np.where(tight, np.rint(_wrap(poses[:, 2] - self._dolly.yaw) / FINE[1]), 99).astype(int)
         return list(zip(x.tolist(), y.tolist(), heading.tolist(), strict=True))
 

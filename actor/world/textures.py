@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]
 Plane = NDArray[Any]
 """float32; a row or a column where nothing changes along the other axis."""
 Color = float | Sequence[float]
-Box = tuple[float, float, float, float]
+Area = tuple[float, float, float, float]
 """Left, top, right, bottom."""
 
 BLACK, YELLOW, ORANGE, STEEL = 0.1, (0.95, 0.78, 0.12), (0.93, 0.43, 0.08), (0.45, 0.48, 0.45)
@@ -155,29 +155,29 @@ class _Canvas:
         self.x = (np.arange(wide, dtype=np.float32)[None, :] + 0.5) / wide
         self.y = (np.arange(high, dtype=np.float32)[:, None] + 0.5) / high
 
-    def _part(self, box: Box) -> tuple[slice, slice]:
+    def _part(self, box: Area) -> tuple[slice, slice]:
         _, high, wide = self.image.shape
         left, top, right, bottom = box
         return slice(round(top * high), round(bottom * high)), slice(round(left * wide), round(right * wide))
 
-    def fill(self, color: Color, *boxes: Box) -> None:
+    def fill(self, color: Color, *boxes: Area) -> None:
         for box in boxes:
             rows, columns = self._part(box)
             self.image[:, rows, columns] = _channels(color)
 
-    def frame(self, color: Color, width: float, box: Box = (0, 0, 1, 1)) -> None:
+    def frame(self, color: Color, width: float, box: Area = (0, 0, 1, 1)) -> None:
         """The border of a box."""
         left, top, right, bottom = box
         self.fill(color, (left, top, right, top + width), (left, bottom - width, right, bottom))
         self.fill(color, (left, top, left + width, bottom), (right - width, top, right, bottom))
 
-    def stripes(self, color: Color, box: Box, x: float, y: float, share: float, cover: float = 1.0) -> None:
+    def stripes(self, color: Color, box: Area, x: float, y: float, share: float, cover: float = 1.0) -> None:
         """Parallel stripes in a box, so many per tile along x and y."""
         rows, columns = self._part(box)
         part, place = self.image[:, rows, columns], self.x[:, columns] * x + self.y[rows] * y
         np.copyto(part, part + cover * (_channels(color) - part), where=place - np.floor(place) < share)
 
-    def hazard(self, box: Box, x: float, y: float) -> None:
+    def hazard(self, box: Area, x: float, y: float) -> None:
         self.fill(YELLOW, box)
         self.stripes(BLACK, box, x, y, 0.5)
 
@@ -193,7 +193,7 @@ class _Canvas:
         slim = np.abs(self.x - middle) / half <= (self.y - top) / (bottom - top)
         np.copyto(self.image, _channels(color), where=slim & (self.y < bottom))
 
-    def cartons(self, box: Box, rows: int, columns: int) -> None:
+    def cartons(self, box: Area, rows: int, columns: int) -> None:
         """A stack of cartons with tape and labels."""
         left, top, right, bottom = box
         w, h = (right - left) / columns, (bottom - top) / rows
@@ -205,13 +205,13 @@ class _Canvas:
             self.fill(0.92, (x + 0.64 * w, y + 0.5 * h, x + 0.88 * w, y + 0.76 * h))
             self.frame(BOARD_EDGE, 0.008, (x, y, x + w, y + h))
 
-    def film(self, box: Box) -> None:
+    def film(self, box: Area) -> None:
         """Goods in stretch film."""
         self.fill((0.86, 0.87, 0.84), box)
         self.stripes(0.72, box, 9, 22, 0.3)
         self.frame(0.64, 0.016, box)
 
-    def pallet(self, box: Box) -> None:
+    def pallet(self, box: Area) -> None:
         """A wooden pallet from the side: boards above and below three blocks."""
         left, top, right, bottom = box
         w, h = right - left, bottom - top
@@ -361,7 +361,7 @@ def _draw_atlas() -> Picture:
     return atlas
 
 
-def _tile(left: int, top: int, right: int, bottom: int) -> Box:
+def _tile(left: int, top: int, right: int, bottom: int) -> Area:
     inset, size = 0.5, ATLAS_SIZE  # between the centres of its texels: neighbours never show
     return (left + inset) / size, (top + inset) / size, (right - inset) / size, (bottom - inset) / size
 
@@ -369,5 +369,5 @@ def _tile(left: int, top: int, right: int, bottom: int) -> Box:
 PATTERNS: dict[Pattern, Picture] = _draw_patterns()
 """Tiles of 2 m x 2 m, nearly grey: a random tint multiplies them."""
 ATLAS: Picture = _draw_atlas()
-TILES: dict[str, Box] = {name: _tile(*pixels) for name, (pixels, _, _) in _OBJECTS.items()}
+TILES: dict[str, Area] = {name: _tile(*pixels) for name, (pixels, _, _) in _OBJECTS.items()}
 """Left, top, right and bottom of an object's face, as shares of the atlas."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import repeat
 from typing import NamedTuple
 
@@ -99,8 +100,10 @@ class DockingWorld:
         return Step(self.sense(), reward, ending)
 
     def advance(self, action: ArrayLike) -> tuple[float, Ending | None]:
-        """`step` without sensing: reward and ending."""
+        """`step` without sensing: reward and ending. Raises ValueError for an action that is not a number."""
         v, w = np.clip(action, -1.0, 1.0).tolist()
+        if math.isnan(v + w):
+            raise ValueError(f"action [{v}, {w}] is not a number")
         if self._shift_at is not None and self.steps >= self._shift_at:
             self._shift_dolly()
         config, substeps = self.config, self.config.substeps

@@ -1,13 +1,17 @@
 """`bench sim`: the environment against the raw pybullet calls that one of its steps makes.
 
-Each round drives one episode in the environment, repeats the pybullet calls of the same steps on the same
-scene in a bare loop, and drives nine worlds as an actor does; so all rows see the same disturbances, and a
-ratio is the median over the rounds.
+Each round drives one episode in a world, repeats the pybullet calls of the same steps on the same scene in
+a bare loop, drives it again through Gymnasium, and drives nine worlds in one batch as an actor does; so all
+rows see the same disturbances, and a ratio is the median over the rounds.
+
+`actor` is worlds, encoder and policy, resets included. `actor_with_duties` does for every finished episode
+what the service does besides: it looks at one more start for the curriculum, and spools the episode.
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,18 +21,20 @@ import numpy as np
 import torch
 
 from actor.inference import Eyes, PolicyActor
-from actor.rollout import Rollout
+from actor.rollout import Finished, Rollout
 from actor.world.drive import advance, wheel_targets
 from actor.world.env import DockingEnv
 from actor.world.sensors import SOLID_GROUP
 from actor.world.world import DockingWorld
 from common.cells import CELLS
 from common.config import Config
+from common.delivery import Spool
 from common.geometry import SE2
-from common.messages import Version
+from common.messages import Episode, Origin, Version
+from common.messages import encode as encode_message
 from common.networks import Perception, Policy, compile_encoder, make_encoder, state_of
 from common.observation import ObservationLayout
-from common.tasks import Task, random_task
+from common.tasks import Task, candidate_task, random_task
 from deploy.bench.report import Report
 
 EPISODE = 22
@@ -45,50 +51,57 @@ def bench_sim(
     rng = np.random.default_rng(config.seed)
     world, gym, crew = DockingWorld(config.world, EPISODE), _gym(config), _Crew(config, rng)
     encode, decide = _bare_networks(config)
-    raw, full, wrapped, resets, actor, encoder, policy = (list[float]() for _ in range(7))
+    times: dict[str, list[float]] = {}
     for index in range(rounds + 1):  # the first warms up
         task = random_task(int(rng.integers(len(CELLS))), config, rng)
         reset, steps, driven = _drive(world, task, rng)
-        bare = _time_raw(world, driven)
-        gym_steps = _repeat(gym, task, driven)
-        acting = crew.time_steps(EPISODE)
-        seen, decided = _time(encode, 5), _time(decide, 5)
+        measured = {
+            "raw_calls": _time_raw(world, driven),
+            "environment": steps,
+            "gymnasium": _repeat(gym, task, driven),
+            "actor": crew.time_steps(EPISODE, duties=False),
+            "actor_with_duties": crew.time_steps(EPISODE, duties=True),
+            "encoder": _time(encode, 5) / crew.worlds,
+            "policy": _time(decide, 5) / crew.worlds,
+            "reset": reset,
+        }
         if index:
-            for values, value in zip(
-                (raw, full, wrapped, resets, actor, encoder, policy),
-                (bare, steps, gym_steps, reset, acting, seen, decided),
-                strict=True,
-            ):
-                values.append(1e3 * value)
+            for name, seconds in measured.items():
+                times.setdefault(name, []).append(1e3 * seconds)
             if progress:
                 progress(index)
-    worlds = len(CELLS)
-    limit = [a + (e + p) / worlds for a, e, p in zip(raw, encoder, policy, strict=True)]
+    times["actor_limit"] = [
+        sum(parts) for parts in zip(times["raw_calls"], times["encoder"], times["policy"], strict=True)
+    ]
     report = Report("sim")
-    report.add("raw_calls", 1e3 / median(raw), "steps/s")
-    report.add("environment", 1e3 / median(full), "steps/s")
-    report.add("gymnasium", 1e3 / median(wrapped), "steps/s")
-    report.add("actor", 1e3 / median(actor), "steps/s")
-    report.add("actor_limit", 1e3 / median(limit), "steps/s")
-    report.add("raw_calls_step", median(raw), "ms")
-    report.add("environment_step", median(full), "ms")
-    report.add("encoder_of_nine", median(encoder), "ms")
-    report.add("policy_of_nine", median(policy), "ms")
-    report.add("reset", median(resets), "ms")
-    report.add("rss_with_eleven_worlds", _rss(), "MB")
-    report.ratios["env_over_raw"] = median(a / b for a, b in zip(raw, full, strict=True))
-    report.ratios["actor_over_limit"] = median(a / b for a, b in zip(limit, actor, strict=True))
+    for name in ("raw_calls", "environment", "gymnasium", "actor", "actor_with_duties", "actor_limit"):
+        report.add(name, 1e3 / median(times[name]), "steps/s")
+    for name in ("raw_calls", "environment", "encoder", "policy"):
+        report.add(f"{name}_per_step", median(times[name]), "ms")
+    report.add("reset", median(times["reset"]), "ms")
+    report.add(f"rss_with_{crew.worlds + 2}_worlds", _rss(), "MB")
+    report.compare("env_over_raw", times["raw_calls"], times["environment"])
+    report.compare("gymnasium_over_raw", times["raw_calls"], times["gymnasium"])
+    report.compare("actor_over_limit", times["actor_limit"], times["actor"])
+    report.compare("actor_with_duties_over_limit", times["actor_limit"], times["actor_with_duties"])
     if soak:
-        before, done = _rss(), 0
-        while done < soak:
-            task = random_task(int(rng.integers(len(CELLS))), config, rng)
-            done += len(_drive(world, task, rng)[2])
-        report.add(f"rss_growth_over_{soak}_steps", _rss() - before, "MB")
+        report.add(f"rss_growth_over_{soak}_steps", _soak(world, crew, config, soak, rng), "MB")
     else:
         report.skipped.append("growth of memory: ask for it with --soak STEPS")
     for each in (world, gym, crew):
         each.close()
     return report
+
+
+def _soak(world: DockingWorld, crew: _Crew, config: Config, steps: int, rng: np.random.Generator) -> float:
+    """MB by which memory grows over so many steps, half of them in a world that changes its cell."""
+    before, done = _rss(), 0
+    while done < steps:
+        task = random_task(int(rng.integers(len(CELLS))), config, rng)
+        alone = len(_drive(world, task, rng)[2])
+        crew.time_steps(max(1, alone // crew.worlds), duties=True)
+        done += 2 * alone
+    return _rss() - before
 
 
 def _drive(world: DockingWorld, task: Task, rng: np.random.Generator) -> tuple[float, float, list[Driven]]:
@@ -174,38 +187,64 @@ def _time_raw(world: DockingWorld, driven: list[Driven]) -> float:
 
 
 class _Crew:
-    """Nine worlds in one batch, as an actor process drives them; the policy is untrained."""
+    """The worlds of one actor in one batch; the policy is untrained."""
 
     def __init__(self, config: Config, rng: np.random.Generator) -> None:
-        self._config, self._rng = config, rng
-        self._rollout = Rollout(config, Eyes(config, make_encoder(config)), len(CELLS), EPISODE)
-        self._actor = PolicyActor(config, len(CELLS), np.random.default_rng(config.seed))
+        self._config, self._rng, self.worlds = config, rng, config.actor.worlds
+        self._rollout = Rollout(config, Eyes(config, make_encoder(config)), self.worlds, EPISODE)
+        self._actor = PolicyActor(config, self.worlds, np.random.default_rng(config.seed))
         networks = state_of(
             perception=Perception(config), policy=Policy(ObservationLayout.of(config), config.network)
         )
         self._actor.load(Version(counter=1), networks)
-        for slot in range(len(CELLS)):
+        for slot in range(self.worlds):
             self._actor.refresh(slot)
+        self._folder = tempfile.TemporaryDirectory()
+        self._spool = Spool(Path(self._folder.name), 2**30)
 
-    def time_steps(self, count: int) -> float:
+    def time_steps(self, count: int, duties: bool) -> float:
         """Seconds per environment step over `count` steps of every world, resets included."""
         began, before = time.perf_counter(), self._rollout.steps
         for _ in range(count):
             for slot in self._rollout.idle:
-                self._rollout.reset(slot, random_task(slot, self._config, self._rng))
-            self._rollout.step(self._actor)
+                self._rollout.reset(slot, random_task(slot % len(CELLS), self._config, self._rng))
+            for finished in self._rollout.step(self._actor):
+                if duties:
+                    self._do_duties(finished)
         return (time.perf_counter() - began) / (self._rollout.steps - before)
+
+    def _do_duties(self, finished: Finished) -> None:
+        """What ActorService does at the end of an episode, but for the bus, which has threads of its own."""
+        columns, slot = finished.columns, finished.slot
+        episode = Episode(
+            digest={},
+            task=finished.task,
+            visual=columns.visual,
+            lidar=columns.lidar,
+            action=columns.action,
+            reward=columns.reward,
+            ending=finished.ending,
+            first_version=Version(),
+            last_version=Version(),
+            category="random",
+        )
+        origin = Origin(actor="bench", boot="bench", seq=self._rollout.steps)
+        self._spool.put(origin, "episode", encode_message(episode))
+        if waiting := self._spool.first():
+            self._spool.remove(waiting[0])
+        self._rollout.look(slot, candidate_task(slot % len(CELLS), self._config, self._rng))
 
     def close(self) -> None:
         self._rollout.close()
+        self._folder.cleanup()
 
 
 def _bare_networks(config: Config) -> tuple[Callable[[], object], Callable[[], object]]:
     """One pass of the encoder in ONNX Runtime and of the policy in torch, for nine worlds."""
-    size, worlds, layout = config.world.camera.size, len(CELLS), ObservationLayout.of(config)
+    size, worlds, layout = config.world.camera.size, config.actor.worlds, ObservationLayout.of(config)
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (worlds, config.encoder.frames_per_code, size, size, 3), dtype=np.uint8)
-    encode = compile_encoder(make_encoder(config), size)
+    encode = None if config.encoder.end_to_end else compile_encoder(make_encoder(config), size)
     policy = Policy(layout, config.network).eval()
     flat, noise = torch.zeros(worlds, layout.size), torch.zeros(worlds, 2)
 
@@ -213,7 +252,7 @@ def _bare_networks(config: Config) -> tuple[Callable[[], object], Callable[[], o
         with torch.inference_mode():
             return policy.sample(flat, noise)
 
-    return lambda: encode(frames), decide
+    return (lambda: encode(frames)) if encode else (lambda: None), decide
 
 
 def _time(call: Callable[[], object], times: int) -> float:

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from common.config import Config, resolve
+from common.config import Config, differing_keys, resolve
 from common.errors import UsageError
 from common.messages import Ending
 from common.tasks import GRID_HEADINGS, PlacedStart, Task, grid
@@ -43,6 +43,15 @@ def find_policy(name: str, config: Config) -> Path | Scripted:
     return max(found, key=lambda snapshot: snapshot.stat().st_mtime_ns)
 
 
+def own_rules(policy: Path | Scripted) -> dict[str, Any]:
+    """The settings of a policy's world other than the default: it is examined in its own world."""
+    if not isinstance(policy, Path):
+        return {}
+    from common.policy_files import load_policy
+
+    return {key: value for key, value, _ in differing_keys(load_policy(policy)[0], Config(), ("world.",))}
+
+
 def run_tasks(
     policy: Path | Scripted,
     tasks: list[Task],
@@ -50,7 +59,7 @@ def run_tasks(
     label: str,
     greedy: bool = True,
     seed: int = 0,
-    max_steps: int = 0,
+    max_steps: int | None = None,
 ) -> list[Ending]:
     """How a policy ends each task, with a progress bar on stderr; by default one process per core."""
     from actor.evaluation import evaluate
@@ -115,7 +124,9 @@ def evaluate(
         bool, typer.Option("--sampled", help="Sample actions, as in training, instead of the greedy ones.")
     ] = False,
     processes: options.Processes = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of sampled actions.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**20, help="Seed of sampled actions and of a grid's scenes.")
+    ] = 0,
     as_json: options.Json = False,
 ) -> None:
     """Drive a policy through fixed, seeded tasks and count how the episodes end."""
@@ -125,19 +136,21 @@ def evaluate(
     if arena and not grid_test:
         raise UsageError("--arena says where a grid is; add --grid quick or --grid paper")
     suite, arena = suite or "train", arena or "validation"
-    tasks = grid(arena, REPEATS[grid_test]) if grid_test else suite_tasks(suite, config)
+    tasks = grid(arena, REPEATS[grid_test], seed) if grid_test else suite_tasks(suite, config)
     name = f"grid-{grid_test}" if grid_test else suite
     found = find_policy(policy, config)
     label = policy if policy == "b0" else str(found)
     endings = run_tasks(found, tasks, processes, f"{label} on {name}", not sampled, seed)
     result: dict[str, Any] = {"policy": label, "suite": name, "seed": seed, "episodes": len(tasks)}
-    result |= {"sampled": sampled, "all": summary(endings)}
+    result |= {"sampled": sampled, "all": summary(endings), "own_rules": own_rules(found)}
     if grid_test:
         result |= {"arena": arena, **by_heading(tasks, endings)}
     if as_json:
         options.print_json(result)
         return
     sys.stdout.write(f"{label} on {name}, {len(tasks)} episodes\n")
+    for key, value in result["own_rules"].items():
+        sys.stdout.write(f"  in a world of its own: {key} = {value}\n")
     rows = {"all": result["all"]}
     if grid_test:
         rows |= {"inside": result["inside"], "outside": result["outside"], **result["headings"]}

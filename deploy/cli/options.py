@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+from io import BytesIO
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +16,9 @@ from common.config import Config, resolve
 from common.errors import UsageError
 from common.tasks import DollyShift, PlacedStart, Task
 from common.world_config import StartRanges, WorldConfig
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 Run = Annotated[Path, typer.Option("--run", help="Run directory; made when it does not exist, else resumed.")]
 Preset = Annotated[str | None, typer.Option(help="Starting configuration: fast (default), paper or smoke.")]
@@ -97,6 +102,36 @@ def parse_cells(text: str) -> list[int]:
     if not cells:
         raise UsageError(f"--cells {text!r} names no cell; write for example 0,3-5")
     return cells
+
+
+def check_file(option: str, file: Path, *suffixes: str) -> None:
+    """Raises UsageError unless `file` can be written and says what it is."""
+    if file.suffix.lower() not in suffixes:
+        raise UsageError(f"{option} {file} must end in {' or '.join(suffixes)}")
+    if file.is_dir():
+        raise UsageError(f"{option} {file} is a folder; name a file")
+    folder = file.resolve().parent
+    if not folder.is_dir():
+        raise UsageError(f"{option} {file}: the folder {folder} does not exist")
+    if not os.access(folder, os.W_OK):
+        raise UsageError(f"{option} {file}: the folder {folder} cannot be written to")
+
+
+def write_file(file: Path, content: bytes) -> None:
+    """Writes a file whole or not at all; raises UsageError when it cannot."""
+    part = file.with_name(file.name + ".part")
+    try:
+        part.write_bytes(content)
+        part.replace(file)
+    except OSError as error:
+        raise UsageError(f"cannot write {file}: {error.strerror}") from None
+
+
+def write_picture(file: Path, picture: Image.Image) -> None:
+    """Writes a picture in the format of its suffix, whole or not at all."""
+    content = BytesIO()
+    picture.save(content, "JPEG" if file.suffix.lower() == ".jpg" else "PNG")
+    write_file(file, content.getvalue())
 
 
 def print_json(value: dict[str, Any]) -> None:

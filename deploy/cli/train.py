@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from common.bus import Keys, open_client
-from common.config import parse
+from common.config import parse, resolve
 from common.errors import UsageError
 from common.tasks import suite as suite_tasks
 from common.telemetry import exit_on_signals
@@ -157,8 +157,7 @@ def _compare(run: Path, suite: str, seed: int) -> dict[str, Any]:
     policies = {"before": run / "snapshots" / "initial", "after": run / "snapshots" / "final"}
     if missing := [path for path in policies.values() if not path.exists()]:
         raise UsageError(f"{missing[0]} is missing: nothing to evaluate")
-    config = parse((run / "config.toml").read_text("utf-8"))
-    tasks = suite_tasks(suite, config)
+    tasks = suite_tasks(suite, resolve())
     found = {
         name: rates(run_tasks(path, tasks, None, f"{name} on {suite}", seed=seed))
         for name, path in policies.items()

@@ -27,16 +27,6 @@ def _group() -> None:
     """Look at the docking world, record drives, check that its tasks can be solved."""
 
 
-def _check_file(option: str, file: Path, *suffixes: str) -> None:
-    """Raises UsageError unless `file` can be written and says what it is."""
-    if file.suffix.lower() not in suffixes:
-        raise UsageError(f"{option} {file} must end in {' or '.join(suffixes)}")
-    if file.is_dir():
-        raise UsageError(f"{option} {file} is a folder; name a file")
-    if not file.resolve().parent.is_dir():
-        raise UsageError(f"{option} {file}: the folder {file.resolve().parent} does not exist")
-
-
 @app.command()
 def preview(
     out: Annotated[Path, typer.Option(help="PNG or JPEG file to write.")],
@@ -52,7 +42,7 @@ def preview(
     settings: options.Settings = None,
 ) -> None:
     """Draw a start: from above with LiDAR beams, from behind, through the camera, with the task's numbers."""
-    _check_file("--out", out, ".png", ".jpg")
+    options.check_file("--out", out, ".png", ".jpg")
     if cell == "all" and steps:
         raise UsageError("--steps does not go with --cell all, which shows starts")
     resolved = options.configuration(None, None, config, settings, None)
@@ -67,7 +57,7 @@ def preview(
     world = DockingWorld(resolved.world, max_steps=steps + 1)
     try:
         if cell == "all":
-            gallery(world, tasks).save(out)
+            options.write_picture(out, gallery(world, tasks))
             sys.stdout.write(f"{out}\n")
             return
         sensed = world.reset(tasks[0])
@@ -77,7 +67,7 @@ def preview(
             sensed = step.sensed
             if step.ending:
                 break
-        draw(world, sensed).save(out)
+        options.write_picture(out, draw(world, sensed))
     finally:
         world.close()
     sys.stdout.write(f"{out}\n")
@@ -95,7 +85,9 @@ def record(
         bool, typer.Option("--sampled", help="Sample actions, as in training, instead of the greedy ones.")
     ] = False,
     still: Annotated[Path | None, typer.Option(help="PNG file for one frame.")] = None,
-    still_at: Annotated[float, typer.Option(min=0, help="Second of the drive that it shows.")] = 3.0,
+    still_at: Annotated[
+        float, typer.Option(min=0, help="Second of the drive that it shows, or its last frame.")
+    ] = 3.0,
     config: options.ConfigFile = None,
     settings: options.Settings = None,
 ) -> None:
@@ -103,9 +95,9 @@ def record(
 
     A trained policy drives in the world that it was trained in; --config and --set are for b0.
     """
-    _check_file("--out", out, ".mp4")
+    options.check_file("--out", out, ".mp4")
     if still:
-        _check_file("--still", still, ".png")
+        options.check_file("--still", still, ".png")
     if policy != "b0" and (config or settings):
         raise UsageError("--config and --set go with --policy b0; a trained policy brings its own world")
     resolved = options.configuration(None, None, config, settings, None)
@@ -113,27 +105,27 @@ def record(
     from actor.recording import drive, write_video
     from deploy.cli.evaluate import find_policy
 
-    rollout, actor = load_driver(find_policy(policy, resolved), not sampled, 1, 0)
+    rollout, actor = load_driver(find_policy(policy, resolved), not sampled, 1)
     world = rollout.worlds[0].config
     task = options.make_task(world, cell, seed, place, shift)
+    kept: list[Image.Image] = []
     ending = None
 
     def frames() -> Iterator[Image.Image]:
         nonlocal ending
-        kept = None
         for index, (frame, found) in enumerate(drive(rollout, actor, task)):
             ending = found
-            if kept is None or index <= still_at / world.control_period:
-                kept = frame
+            if index <= still_at / world.control_period:
+                kept[:] = [frame]
             yield frame
-        if still and kept:
-            kept.save(still)
 
     try:
         count = write_video(out, frames(), world.control_period)
     finally:
         rollout.close()
-    sys.stdout.write(f"{out}: {count} frames, {ending}\n")
+    if still:
+        options.write_picture(still, kept[0])
+    sys.stdout.write(f"{out}: {count} frames, {count * world.control_period:.1f} s, {ending}\n")
 
 
 @app.command()
@@ -151,7 +143,7 @@ def check(
 ) -> None:
     """Draw random tasks of every training cell, show their geometric properties, and drive some of them."""
     if out:
-        _check_file("--out", out, ".md")
+        options.check_file("--out", out, ".md")
     resolved = options.configuration(None, None, config, settings, seed)
     from deploy.cli.evaluate import run_tasks
     from deploy.task_table import as_markdown, properties_of_cells, starts_to_solve
@@ -173,7 +165,7 @@ def check(
         )
     text = text.rstrip() + "\n"
     if out:
-        out.write_text(text, "utf-8")
+        options.write_file(out, text.encode())
     if as_json:
         options.print_json(result)
     else:
