@@ -8,7 +8,7 @@ import pytest
 
 from actor.world.drive import advance, wheel_targets
 from actor.world.reward import ending_of, reward
-from actor.world.world import DockingWorld
+from actor.world.world import NEAR, DockingWorld
 from common.cells import CELLS, ROOMS, Box
 from common.config import resolve
 from common.geometry import SE2, Rectangle
@@ -99,7 +99,9 @@ def test_obstacle_contact_is_other_contact_at_its_face(world):
     put(world, SE2())
     half_x, half_y, height, kind = obstacle_catalogue(CONFIG.world.obstacles)[3]
     box = Box(Rectangle(SE2(0.0, 2.0, math.pi / 2), half_x, half_y), height, kind)
-    world.bodies.arrange((Obstacle(3, box),))
+    world.scene = Scene(SE2(), world.dolly, (Obstacle(3, box),))
+    world.bodies.arrange(world.scene.obstacles)
+    world.stand(SE2(), world.dolly)
     assert drive(world, (1.0, 0.0))[-1].ending == "other_contact"
     front = world.pose.y + CONFIG.world.robot.length / 2
     assert front == pytest.approx(2.0 - half_x, abs=0.006)
@@ -140,6 +142,30 @@ def test_actions_beyond_the_limits_are_cut(world):
     put(world, SE2())
     world.step((1.0, -1.0))
     assert world.pose == far
+
+
+def test_watching_every_substep_of_every_step_would_change_nothing(monkeypatch):
+    """Drives of all kinds, by the world as it is and by one that never takes anything to be out of reach."""
+    config, rng = resolve("smoke").world, np.random.default_rng(6)
+    usual, watchful = DockingWorld(config, 40), DockingWorld(config, 40)
+    monkeypatch.setattr(watchful, "_is_anything_near", lambda targets: True)
+    near = steps = 0
+    for index in range(60):
+        task = random_task(index % len(ROOMS), resolve("smoke"), rng)
+        habit = rng.choice([-0.8, 0.8]), rng.uniform(-0.3, 0.3)
+        for world in (usual, watchful):
+            world.place(task)
+        ending = None
+        while ending is None:
+            action = np.clip(habit + rng.normal(0, 0.5, 2), -1, 1)
+            ending = (found := usual.advance(action))[1]
+            assert found == watchful.advance(action)
+            assert (usual.pose, usual.speeds) == (watchful.pose, watchful.speeds)
+            near += usual._gap < NEAR
+            steps += 1
+    assert 100 < near < steps / 2
+    usual.close()
+    watchful.close()
 
 
 def test_standing_still_runs_out_of_time_and_costs_the_slow_penalty(world):

@@ -20,6 +20,10 @@ class Motion:
     left: Array
     right: Array
 
+    def since(self, first: int) -> Motion:
+        """Without the substeps before `first`."""
+        return Motion(*(part[first:] for part in (self.x, self.y, self.yaw, self.left, self.right)))
+
 
 def wheel_targets(config: RobotConfig, v: float, w: float) -> tuple[float, float]:
     """Wheel speeds for v (m/s) and w (rad/s), slowed down together when one would exceed the limit."""

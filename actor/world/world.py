@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +14,13 @@ from actor.world.bullet import connect
 from actor.world.drive import advance, wheel_targets
 from actor.world.reward import ending_of, reward
 from actor.world.sensors import Camera, Lidar
-from common.geometry import SE2, Rectangle, rectangles_overlap, wrap
+from common.geometry import SE2, Rectangle, as_rows, rectangles_overlap, separations, wrap
 from common.messages import Ending
-from common.tasks import START_MARGIN, Scene, Task, build_scene, random_stream
+from common.tasks import START_MARGIN, Scene, Task, build_scene, dolly_sides, random_stream, surfaces
 from common.world_config import WorldConfig
+
+NEAR = 0.1
+"""Free space beyond its reach in which a robot is not watched at every substep, m; docked, it has 0.055."""
 
 
 class Sensed(NamedTuple):
@@ -88,6 +90,8 @@ class DockingWorld:
     def stand(self, robot: SE2, dolly: SE2) -> None:
         """Puts robot and dolly where they have not driven to."""
         self.pose, self.dolly = robot, dolly
+        self._touchable = as_rows([*surfaces(self.task.cell, self.scene), *dolly_sides(dolly, self.config)])
+        self._gap = 0.0  # what is known to be free around the robot, m
         self.bodies.hide(self.bodies.robot)
         self._detect()  # or Bullet would keep contacts of the old place
         self.bodies.place(self.bodies.dolly, dolly)
@@ -107,23 +111,21 @@ class DockingWorld:
         if self._shift_at is not None and self.steps >= self._shift_at:
             self._shift_dolly()
         config, substeps = self.config, self.config.substeps
-        motion = advance(
-            config.robot,
-            self.pose,
-            self.speeds,
-            wheel_targets(config.robot, v, w),
-            config.control_period / substeps,
-            substeps,
-        )
+        targets = wheel_targets(config.robot, v, w)
+        # where nothing is near, the last substep is enough; that saves 5% of a step
+        first = 0 if self._is_anything_near(targets) else substeps - 1
+        period = config.control_period / substeps
+        motion = advance(config.robot, self.pose, self.speeds, targets, period, substeps).since(first)
         distances = np.hypot(motion.x - self.dolly.x, motion.y - self.dolly.y).tolist()
         half = motion.yaw / 2
-        places = zip(motion.x.tolist(), motion.y.tolist(), repeat(0.0), strict=False)
-        turns = zip(repeat(0.0), repeat(0.0), np.sin(half).tolist(), np.cos(half).tolist(), strict=False)
+        nothing = [0.0] * (substeps - first)
+        places = zip(motion.x.tolist(), motion.y.tolist(), nothing, strict=True)
+        turns = zip(nothing, nothing, np.sin(half).tolist(), np.cos(half).tolist(), strict=True)
         ending: Ending | None = None
         docked = config.reward.success_distance
         move, detect, points, robot = self.bodies.move, self._detect, self._points, self.bodies.robot
         # the loop makes Bullet's calls and next to nothing else: it runs 36 times a control step
-        for k, (place, turn) in enumerate(zip(places, turns, strict=False)):
+        for k, (place, turn) in enumerate(zip(places, turns, strict=True)):
             move(robot, place, turn)
             detect()
             near = points(robot)
@@ -149,6 +151,24 @@ class DockingWorld:
         """Frees the physics client."""
         if self.bullet.isConnected():
             self.bullet.disconnect()
+
+    def _is_anything_near(self, targets: tuple[float, float]) -> bool:
+        """Whether the robot could touch anything, or dock, in the next control step.
+
+        No point of it goes farther than its centre does and its farthest corner turns, and speed and rate of
+        turn change steadily towards their targets. The gap is measured anew when that has used it up.
+        """
+        robot, pose, period = self.config.robot, self.pose, self.config.control_period
+        half = robot.width / 2, robot.length / 2
+        (left, right), (new_left, new_right) = self.speeds, targets
+        speed = max(abs(left + right), abs(new_left + new_right)) / 2
+        rate = max(abs(right - left), abs(new_right - new_left)) / robot.track
+        reach = period * (speed + rate * math.hypot(*half))
+        self._gap -= reach
+        if self._gap < NEAR:
+            here = np.array([[pose.x, pose.y, pose.yaw]])
+            self._gap = float(separations(here, half, self._touchable).min()) - reach
+        return self._gap < NEAR
 
     def _shift_dolly(self) -> None:
         """Moves the dolly as the task asks, unless the robot stands where it is to be."""
