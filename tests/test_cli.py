@@ -43,7 +43,7 @@ def call(monkeypatch, capsys, *arguments):
         (["train", "--eval", "grid"], "short, train"),
         (["evaluate", "nowhere"], "nowhere does not exist"),
         (["evaluate", ".", "--suite", "short"], "no policy"),
-        (["world", "preview", "--out", "x.png", "--cell", "9"], "cells are 0 to 8"),
+        (["world", "preview", "--out", "x.png", "--cell", "9"], "--cell '9' does not exist"),
         (["world", "preview", "--out", "nowhere/x.png"], "does not exist"),
         (["world", "preview", "--out", "x.gif"], ".png or .jpg"),
         (["nonsense"], "nonsense"),
