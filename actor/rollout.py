@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from actor.inference import Actor, Eyes
 from actor.world.world import DockingWorld, Sensed
 from common.config import Config
-from common.messages import Candidate, Ending
+from common.messages import Candidate, Ending, Episode, Version
 from common.observation import ACTION_SIZE, HISTORY, Columns, ObservationLayout, observe
 from common.tasks import Task
 
@@ -23,6 +23,21 @@ class Finished:
     task: Task
     columns: Columns
     ending: Ending
+
+    def message(self, digest: dict[str, str], first: Version, last: Version, category: str) -> Episode:
+        """What is sent to the learner; `first` and `last` version of the weights that drove."""
+        return Episode(
+            digest=digest,
+            task=self.task,
+            visual=self.columns.visual,
+            lidar=self.columns.lidar,
+            action=self.columns.action,
+            reward=self.columns.reward,
+            ending=self.ending,
+            first_version=first,
+            last_version=last,
+            category=category,
+        )
 
 
 class Rollout:

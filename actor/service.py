@@ -23,7 +23,6 @@ from common.messages import (
     Candidate,
     Candidates,
     ContractReply,
-    Episode,
     Outcome,
     Proposal,
     Proposals,
@@ -143,21 +142,12 @@ class ActorService:
                     self._actor.refresh(slot)
 
     def _ship(self, finished: Finished) -> None:
-        slot, proposal, columns = finished.slot, self._proposals[finished.slot], finished.columns
-        self._agent_steps[slot] += len(columns.reward) - 1
+        slot, proposal = finished.slot, self._proposals[finished.slot]
+        self._agent_steps[slot] += len(finished.columns.reward) - 1
         self._endings[finished.ending] += 1
         category = proposal.category if proposal else "unserved"
-        episode = Episode(
-            digest=self.contract.digest,
-            task=finished.task,
-            visual=columns.visual,
-            lidar=columns.lidar,
-            action=columns.action,
-            reward=columns.reward,
-            ending=finished.ending,
-            first_version=self._first_version[slot],
-            last_version=self._actor.version(slot),
-            category=category,
+        episode = finished.message(
+            self.contract.digest, self._first_version[slot], self._actor.version(slot), category
         )
         self._episodes.put(self.keys.trajectory, episode)
         if proposal is not None and not self._reports.spool.full:

@@ -30,7 +30,7 @@ from common.cells import CELLS
 from common.config import Config
 from common.delivery import Spool
 from common.geometry import SE2
-from common.messages import Episode, Origin, Version
+from common.messages import Origin, Version
 from common.messages import encode as encode_message
 from common.networks import Perception, Policy, compile_encoder, make_encoder, state_of
 from common.observation import ObservationLayout
@@ -215,19 +215,8 @@ class _Crew:
 
     def _do_duties(self, finished: Finished) -> None:
         """What ActorService does at the end of an episode, but for the bus, which has threads of its own."""
-        columns, slot = finished.columns, finished.slot
-        episode = Episode(
-            digest={},
-            task=finished.task,
-            visual=columns.visual,
-            lidar=columns.lidar,
-            action=columns.action,
-            reward=columns.reward,
-            ending=finished.ending,
-            first_version=Version(),
-            last_version=Version(),
-            category="random",
-        )
+        slot = finished.slot
+        episode = finished.message({}, Version(), Version(), "random")
         origin = Origin(actor="bench", boot="bench", seq=self._rollout.steps)
         self._spool.put(origin, "episode", encode_message(episode))
         if waiting := self._spool.first():
