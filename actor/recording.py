@@ -53,7 +53,7 @@ def write_video(path: Path, frames: Iterator[Image.Image], period: float) -> int
                         "libx264", rate=Fraction(1 / period).limit_denominator(1000)
                     )
                     stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, "yuv420p"
-                    stream.options = {"crf": "23"}
+                    stream.options = {"crf": "28"}
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(frame), format="rgb24")))
                 count += 1
             if stream is not None:

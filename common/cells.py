@@ -225,6 +225,8 @@ ARENAS: tuple[Cell, ...] = (
 
 ROOMS = CELLS + ARENAS
 """By index: 0 to 8 the training cells, 9 the validation arena, 10 the test arena."""
+ROOM_NAMES = (*(str(index) for index in range(len(CELLS))), *(arena.name for arena in ARENAS))
+"""What users call them, in the same order."""
 
 
 def check_cell(cell: int) -> int:

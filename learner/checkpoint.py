@@ -11,6 +11,7 @@ from torch import Tensor
 
 from common.config import Config, differing_keys, parse
 from common.errors import UsageError
+from common.files import write_atomically
 from common.policy_files import CONFIG, NETWORKS, load_tensors, save_folder
 from learner.sac import SAC
 
@@ -37,7 +38,7 @@ class RunDirectory:
             self.config = config
             folder.mkdir(parents=True, exist_ok=True)
             (folder / CONFIG).write_text(config.to_toml(), "utf-8")
-            write_atomically(identity, json.dumps({"schema": RUN_SCHEMA, "epoch": 0}))
+            write_atomically(identity, json.dumps({"schema": RUN_SCHEMA, "epoch": 0}).encode())
 
     def _open(self, identity: Path, wanted: Config | None) -> Config:
         try:
@@ -65,7 +66,7 @@ class RunDirectory:
         identity = self.folder / "run.json"
         values = json.loads(identity.read_text("utf-8"))
         values["epoch"] += 1
-        write_atomically(identity, json.dumps(values))
+        write_atomically(identity, json.dumps(values).encode())
         return int(values["epoch"])
 
     def save(self, sac: SAC, frozen: dict[str, Tensor], env_steps: int) -> None:
@@ -108,10 +109,3 @@ class RunDirectory:
     def _write(self, folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, int]) -> None:
         texts = {CONFIG: self.config.to_toml(), "state.json": json.dumps(state)}
         save_folder(folder, texts, tensors)
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Replaces a small file by way of a temporary name."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, "utf-8")
-    part.replace(path)

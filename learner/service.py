@@ -20,6 +20,7 @@ from common.bus import Keys, QueryServer, announce, publish, serve
 from common.contract import check_digest, contract_encoder, make_contract
 from common.delivery import unpack_header
 from common.errors import UsageError
+from common.files import write_atomically
 from common.messages import (
     ENDINGS,
     Acknowledgement,
@@ -35,7 +36,7 @@ from common.networks import state_of
 from common.observation import ObservationLayout
 from common.telemetry import Rate, Reporter
 from common.weights import pack
-from learner.checkpoint import RunDirectory, write_atomically
+from learner.checkpoint import RunDirectory
 from learner.replay.buffer import Replay
 from learner.replay.log import EpisodeLog
 from learner.sac import SAC, Losses
@@ -169,7 +170,9 @@ class LearnerService:
         self.run_directory.save(self.sac, self._frozen, self._log.env_steps)
         self._snapshot("final")
         self._board.close()
-        write_atomically(self.run_directory.folder / "summary.json", json.dumps(self.summary(), indent=1))
+        write_atomically(
+            self.run_directory.folder / "summary.json", json.dumps(self.summary(), indent=1).encode()
+        )
 
     def summary(self) -> dict[str, Any]:
         """The run in numbers."""

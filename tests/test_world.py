@@ -168,6 +168,17 @@ def test_watching_every_substep_of_every_step_would_change_nothing(monkeypatch):
     watchful.close()
 
 
+def test_docking_under_a_wide_dolly_is_seen_at_its_substep():
+    """Its legs are too far away to tell that the robot is about to dock."""
+    config = resolve(overrides=("world.dolly.width=2.5",)).world
+    world = DockingWorld(config, 100)
+    put(world, SE2(0.0, 1.0))
+    assert drive(world, (1.0, 0.0))[-1].ending == "success"
+    distance = math.hypot(world.pose.x - world.dolly.x, world.pose.y - world.dolly.y)
+    assert distance == pytest.approx(config.reward.success_distance, abs=0.006)
+    world.close()
+
+
 def test_standing_still_runs_out_of_time_and_costs_the_slow_penalty(world):
     put(world, SE2())
     steps = drive(world, (0.0, 0.0), limit=100)

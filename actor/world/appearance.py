@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.cells import ARENAS, CELLS
+from common.cells import ROOMS
 from common.tasks import CATALOGUE_SIZE
 from common.world_config import LookRanges, Pattern, RandomizationConfig
 
@@ -45,9 +45,8 @@ class Appearance:
 
 def look_ranges(config: RandomizationConfig, cell: int) -> LookRanges:
     """The ranges of a room by its index: each arena has its own."""
-    if cell < len(CELLS):
-        return config.training
-    return getattr(config, ARENAS[cell - len(CELLS)].name)  # type: ignore[no-any-return]
+    arenas = {"validation": config.validation, "test": config.test}
+    return arenas.get(ROOMS[cell].name, config.training)
 
 
 def draw_appearance(rng: np.random.Generator, config: RandomizationConfig, cell: int) -> Appearance:

@@ -20,7 +20,7 @@ from common.tasks import START_MARGIN, Scene, Task, build_scene, dolly_sides, ra
 from common.world_config import WorldConfig
 
 NEAR = 0.1
-"""Free space beyond its reach in which a robot is not watched at every substep, m; docked, it has 0.055."""
+"""Free space beyond its reach in which a robot is not watched at every substep, m."""
 
 
 class Sensed(NamedTuple):
@@ -91,7 +91,7 @@ class DockingWorld:
         """Puts robot and dolly where they have not driven to."""
         self.pose, self.dolly = robot, dolly
         self._touchable = as_rows([*surfaces(self.task.cell, self.scene), *dolly_sides(dolly, self.config)])
-        self._gap = 0.0  # what is known to be free around the robot, m
+        self._gap = 0.0  # how far the robot may surely go before it touches anything or docks, m
         self.bodies.hide(self.bodies.robot)
         self._detect()  # or Bullet would keep contacts of the old place
         self.bodies.place(self.bodies.dolly, dolly)
@@ -167,7 +167,9 @@ class DockingWorld:
         self._gap -= reach
         if self._gap < NEAR:
             here = np.array([[pose.x, pose.y, pose.yaw]])
-            self._gap = float(separations(here, half, self._touchable).min()) - reach
+            to_touch = float(separations(here, half, self._touchable).min())
+            to_dock = math.hypot(pose.x - self.dolly.x, pose.y - self.dolly.y)
+            self._gap = min(to_touch, to_dock - self.config.reward.success_distance) - reach
         return self._gap < NEAR
 
     def _shift_dolly(self) -> None:

@@ -6,8 +6,6 @@ import sys
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import Progress
 
 from deploy.cli import options
 
@@ -35,9 +33,8 @@ def sim(
     resolved = options.configuration(preset, None, config, settings, seed)
     from deploy.bench.sim import bench_sim
 
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        row = bar.add_task("rounds", total=rounds)
-        report = bench_sim(resolved, rounds, soak, lambda done: bar.update(row, completed=done))
+    with options.progress("rounds", rounds) as done:
+        report = bench_sim(resolved, rounds, soak, done)
     if as_json:
         options.print_json(report.to_json())
     else:

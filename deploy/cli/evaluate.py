@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.console import Console
-from rich.progress import Progress
 
 from common.config import Config, differing_keys, resolve
 from common.errors import UsageError
@@ -64,17 +62,8 @@ def run_tasks(
     """How a policy ends each task, with a progress bar on stderr; by default one process per core."""
     from actor.evaluation import evaluate
 
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        row = bar.add_task(label, total=len(tasks))
-        return evaluate(
-            policy,
-            tasks,
-            processes or os.cpu_count() or 1,
-            greedy,
-            seed,
-            lambda done: bar.update(row, completed=done),
-            max_steps,
-        )
+    with options.progress(label, len(tasks)) as report:
+        return evaluate(policy, tasks, processes or os.cpu_count() or 1, greedy, seed, report, max_steps)
 
 
 def summary(endings: list[Ending]) -> dict[str, Any]:

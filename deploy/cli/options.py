@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.progress import Progress
 
-from common.cells import ARENAS, CELLS, check_cell
+from common.cells import ROOM_NAMES, check_cell
 from common.config import Config, resolve
 from common.errors import UsageError
+from common.files import write_atomically
 from common.tasks import DollyShift, PlacedStart, Task
 from common.world_config import StartRanges, WorldConfig
 
@@ -85,10 +90,9 @@ def make_task(world: WorldConfig, room: str, seed: int, place: str | None, shift
         raise UsageError(
             f"--shift {shift!r} must be STEP,X,Y,YAW: from step 1 on, within 10 m and 180 degrees"
         ) from None
-    names = [*(str(cell) for cell in range(len(CELLS))), *(arena.name for arena in ARENAS)]
-    if room not in names:
-        raise UsageError(f"--cell {room!r} does not exist; choose one of {', '.join(names)}")
-    return Task(cell=names.index(room), seed=seed, start=start, shift=moves)
+    if room not in ROOM_NAMES:
+        raise UsageError(f"--cell {room!r} does not exist; choose one of {', '.join(ROOM_NAMES)}")
+    return Task(cell=ROOM_NAMES.index(room), seed=seed, start=start, shift=moves)
 
 
 def parse_cells(text: str) -> list[int]:
@@ -119,10 +123,8 @@ def check_file(option: str, file: Path, *suffixes: str) -> None:
 
 def write_file(file: Path, content: bytes) -> None:
     """Writes a file whole or not at all; raises UsageError when it cannot."""
-    part = file.with_name(file.name + ".part")
     try:
-        part.write_bytes(content)
-        part.replace(file)
+        write_atomically(file, content)
     except OSError as error:
         raise UsageError(f"cannot write {file}: {error.strerror}") from None
 
@@ -132,6 +134,14 @@ def write_picture(file: Path, picture: Image.Image) -> None:
     content = BytesIO()
     picture.save(content, "JPEG" if file.suffix.lower() == ".jpg" else "PNG")
     write_file(file, content.getvalue())
+
+
+@contextmanager
+def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr, where that is a terminal; the function takes how much is done."""
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        row = bar.add_task(label, total=total)
+        yield lambda done: bar.update(row, completed=done)
 
 
 def print_json(value: dict[str, Any]) -> None:

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import Progress
 
-from common.cells import ARENAS, CELLS
+from common.cells import CELLS, ROOM_NAMES
 from common.errors import UsageError
 from deploy.cli import options
 
@@ -46,9 +44,7 @@ def preview(
     if cell == "all" and steps:
         raise UsageError("--steps does not go with --cell all, which shows starts")
     resolved = options.configuration(None, None, config, settings, None)
-    rooms = (
-        [str(i) for i in range(len(CELLS))] + [arena.name for arena in ARENAS] if cell == "all" else [cell]
-    )
+    rooms = ROOM_NAMES if cell == "all" else (cell,)
     tasks = [options.make_task(resolved.world, room, seed, place, shift) for room in rooms]
     from actor.world.views import gallery
     from actor.world.views import preview as draw
@@ -148,9 +144,8 @@ def check(
     from deploy.cli.evaluate import run_tasks
     from deploy.task_table import as_markdown, properties_of_cells, starts_to_solve
 
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        row = bar.add_task("tasks", total=9 * tasks)
-        table = properties_of_cells(resolved, tasks, lambda done: bar.update(row, completed=done))
+    with options.progress("tasks", len(CELLS) * tasks) as report:
+        table = properties_of_cells(resolved, tasks, report)
     result = {"seed": resolved.seed, "tasks_per_cell": tasks, "cells": table}
     text = as_markdown(table)
     if solve:
