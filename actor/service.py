@@ -75,6 +75,11 @@ class ActorService:
         self._reporter = Reporter(session, self.keys, "actor", name)
         self._rate = Rate()
 
+    @property
+    def worlds(self) -> int:
+        """How many worlds it drives."""
+        return len(self._rollout)
+
     def run(self) -> None:
         """Drives until SystemExit."""
         for slot in range(len(self._rollout)):

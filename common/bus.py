@@ -40,6 +40,7 @@ class Keys:
     def __init__(self, run: str) -> None:
         self.root = f"navaclq/{run}"
         self.trajectory = f"{self.root}/trajectory"
+        self.frames = f"{self.root}/frames"
         self.contract = f"{self.root}/contract"
         self.version = f"{self.root}/weights/version"
         self.task = f"{self.root}/curriculum/task"

@@ -17,7 +17,7 @@ import tomli_w
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from common.errors import UsageError
-from common.settings import Count, Fraction, Positive, Section
+from common.settings import Count, Fraction, NotNegative, Positive, Section
 from common.world_config import StartRanges, WorldConfig
 
 Preset = Literal["paper", "fast", "smoke"]
@@ -33,7 +33,37 @@ class EncoderConfig(Section):
     """4: one code of the 12-channel stack per step (paper); 1: one code per frame, four stacked by index."""
     channels: tuple[Count, Count, Count, Count] = (16, 16, 32, 4)
     end_to_end: bool = False
-    """True trains the encoder with the critic from uint8 frames; False freezes it at its seeded start."""
+    """True trains the encoder with the critic from uint8 frames, from random weights; False freezes it."""
+    weights: Annotated[str, Field(min_length=1)] = "random"
+    """Of a frozen encoder: one that is shipped (`fast`, `paper`), `random` at its seeded initialisation, or
+    the folder of one that `navaclq pretrain` made."""
+
+
+class PretrainingConfig(Section):
+    """Pre-training of the encoder on frames of random drives (section 3.5)."""
+
+    objective: Literal["reconstruction", "semantic"] = "semantic"
+    """`reconstruction` is the paper's autoencoder; `semantic` adds what the simulator knows of the dolly."""
+    sequences: Count = 50_000
+    """Stacks of four frames to learn from; one ends at every frame (section 3.5)."""
+    drive_steps: Count = 24
+    """Control steps of a drive, unless a contact ends it before (decided)."""
+    near_share: Fraction = 0.5
+    """Share of drives that start in ranges narrowed towards `curriculum.gate.ranges` (decided)."""
+    epochs: Count = 10
+    batch_size: Count = 128
+    learning_rate: Positive = 1e-3
+    """Of Adam, at the start."""
+    final_learning_rate: Positive = 1e-5
+    """At the end of a cosine (decided)."""
+    mask_weight: NotNegative = 0.1
+    """Weight of the dolly mask's cross-entropy against the pixels' squared error; `semantic` only."""
+    pose_weight: NotNegative = 0.1
+    """Weight of visibility, bearing, distance and relative yaw; `semantic` only."""
+    precision: Literal["bfloat16", "float32"] = "bfloat16"
+    """Of the products; on a CPU with AMX bfloat16 is four times as fast, on an old one slower."""
+    probe_drives: Annotated[int, Field(ge=9)] = 900
+    """Drives of each of the three sets of frames on which the finished encoder is examined."""
 
 
 class NetworkConfig(Section):
@@ -187,6 +217,7 @@ class Config(Section):
     variant: Variant = "navacl-q"
     world: WorldConfig = WorldConfig()
     encoder: EncoderConfig = EncoderConfig()
+    pretraining: PretrainingConfig = PretrainingConfig()
     network: NetworkConfig = NetworkConfig()
     sac: SacConfig = SacConfig()
     replay: ReplayConfig = ReplayConfig()
@@ -202,7 +233,7 @@ class Config(Section):
 VARIANTS: dict[str, dict[str, Any]] = {
     "navacl-q": {},
     "rnd": {"curriculum": {"algorithm": "rnd", "gate": {"enabled": False}}},
-    "e2e": {"encoder": {"end_to_end": True}},
+    "e2e": {"encoder": {"end_to_end": True, "weights": "random"}},
 }
 
 

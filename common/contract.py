@@ -5,7 +5,6 @@ The digest holds one short hash per field, so that a refusal can name the field 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable
@@ -15,14 +14,14 @@ from typing import Any
 
 import zenoh
 from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 
 from common.bus import Keys, ask
 from common.cells import CELLS
 from common.config import Config, differing_keys, override, parse
+from common.encoders import content_hash
 from common.errors import UsageError
 from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
-from common.networks import Encoder, load_state, make_encoder, state_of
+from common.networks import Encoder, load_state, make_encoder
 from common.observation import HISTORY
 
 AGREED = {
@@ -42,7 +41,7 @@ AGREED = {
 
 def _short(value: Any) -> str:
     data = value if isinstance(value, bytes) else json.dumps(value, sort_keys=True).encode()
-    return hashlib.sha256(data).hexdigest()[:16]
+    return content_hash(data)
 
 
 def digest(config: Config, encoder: bytes) -> dict[str, str]:
@@ -69,10 +68,9 @@ def check_digest(ours: dict[str, str], theirs: dict[str, str]) -> None:
             )
 
 
-def make_contract(run: str, config: Config) -> ContractReply:
-    """The contract of a new run."""
-    weights = save_tensors(state_of(encoder=make_encoder(config)))
-    return ContractReply(run=run, config=config.to_toml(), encoder=weights, digest=digest(config, weights))
+def make_contract(run: str, config: Config, encoder: bytes) -> ContractReply:
+    """The contract of a run with these weights of its frozen encoder."""
+    return ContractReply(run=run, config=config.to_toml(), encoder=encoder, digest=digest(config, encoder))
 
 
 def contract_encoder(contract: ContractReply, config: Config) -> Encoder:

@@ -72,6 +72,11 @@ class Message(BaseModel):
     max_bytes: ClassVar[int] = MEGABYTE
 
 
+def _check_array(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: str) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        raise MessageError(f"{name} is {array.dtype} {array.shape}, expected {dtype} {shape}")
+
+
 class Origin(Message):
     """Who made a message, once and for all: retries carry the same one, so that duplicates are recognised."""
 
@@ -138,11 +143,34 @@ class Episode(Message):
             "reward": ((rows,), "float32"),
         }
         for name, (shape, dtype) in expected.items():
-            array: NDArray[Any] = getattr(self, name)
-            if array.shape != shape or array.dtype != dtype:
-                raise MessageError(f"{name} is {array.dtype} {array.shape}, expected {dtype} {shape}")
+            _check_array(name, getattr(self, name), shape, dtype)
         if np.abs(self.action).max() > 1.0:
             raise MessageError("action outside [-1, 1]")
+
+
+class Frames(Message):
+    """A random drive as the camera saw it, for pre-training; see common/frames.py."""
+
+    max_bytes: ClassVar[int] = 64 * MEGABYTE
+
+    digest: Digest
+    task: TrainingTask
+    frame: WireArray
+    mask: WireArray
+    goal: WireArray
+
+    def check_layout(self, size: int, most: int) -> None:
+        """Raises MessageError unless these are 1 to `most` frames of `size` pixels a side."""
+        rows = len(self.frame)
+        expected = {
+            "frame": ((rows, size, size, 3), "uint8"),
+            "mask": ((rows, size * size // 8), "uint8"),
+            "goal": ((rows, 3), "float32"),
+        }
+        if not 1 <= rows <= most:
+            raise MessageError(f"drive of {rows} frames; 1 to {most} are possible")
+        for name, (shape, dtype) in expected.items():
+            _check_array(name, getattr(self, name), shape, dtype)
 
 
 class TaskQuery(Message):
@@ -228,6 +256,8 @@ class ContractReply(Message):
     encoder: bytes
     """Weights of the frozen encoder, safetensors."""
     digest: Digest
+    job: Literal["training", "pretraining"] = "training"
+    """What actors are wanted for: episodes, or frames."""
 
 
 class Stat(Message):

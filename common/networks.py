@@ -71,23 +71,33 @@ class Encoder(nn.Module):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)  # type: ignore[arg-type]
         if isinstance(blocks[-1], LightBlock):
-            with torch.no_grad():
-                blocks[-1].down.weight *= LIGHT_CODE_SCALE
+            self.scale_codes(LIGHT_CODE_SCALE)
 
     def forward(self, frames: Tensor) -> Tensor:
         """(B, 3 * frames_per_code, S, S) float32 in [0, 1] -> (B, code) float32."""
         maps: Tensor = self.blocks(frames)
         return maps.flatten(1)
 
+    def scale_codes(self, factor: float) -> None:
+        """Multiplies all codes by a positive factor, through the weights of the last block."""
+        with torch.no_grad():
+            for name, parameter in self.blocks[-1].named_parameters():
+                if name in ("down.weight", "down.bias", "residual.bias"):  # ReLU lets the factor through
+                    parameter.mul_(factor)
+
     def encode_stacks(self, frames: Tensor) -> Tensor:
         """(B, 4, S, S, 3) uint8 -> (B, codes * code) float32, for training end to end."""
         b, n, s = frames.shape[:3]
         grouped = frames.reshape(b * n // self.frames_per_code, self.frames_per_code, s, s, 3)
-        codes: Tensor = self(_to_channels(grouped))
-        return codes.reshape(b, -1)
+        return self.encode_groups(grouped).reshape(b, -1)
+
+    def encode_groups(self, frames: Tensor) -> Tensor:
+        """(B, frames_per_code, S, S, 3) uint8 -> (B, code) float32."""
+        codes: Tensor = self(to_channels(frames))
+        return codes
 
 
-def _to_channels(frames: Tensor) -> Tensor:
+def to_channels(frames: Tensor) -> Tensor:
     """(B, F, S, S, 3) uint8 -> (B, 3 F, S, S) float32 in [0, 1]."""
     b, f, s = frames.shape[:3]
     return frames.permute(0, 1, 4, 2, 3).reshape(b, 3 * f, s, s).float() / 255.0
@@ -100,13 +110,8 @@ def make_encoder(config: Config) -> Encoder:
         return Encoder(config.encoder)
 
 
-def compile_encoder(encoder: Encoder, image_size: int) -> Callable[[NDArray[np.uint8]], NDArray[np.float16]]:
-    """A frozen encoder as an ONNX Runtime function on one thread.
-
-    Takes (B, frames_per_code, S, S, 3) uint8, returns the codes (B, code) float16.
-    """
-    import onnxruntime  # heavy, and only processes that encode need it
-
+def export_onnx(encoder: Encoder, image_size: int) -> bytes:
+    """The encoder as an ONNX graph: `frames` (B, 3 * frames_per_code, S, S) float32 to `code` (B, code)."""
     channels = 3 * encoder.frames_per_code
     graph = BytesIO()
     torch.onnx.export(
@@ -118,15 +123,29 @@ def compile_encoder(encoder: Encoder, image_size: int) -> Callable[[NDArray[np.u
         output_names=["code"],
         dynamic_axes={"frames": {0: "batch"}, "code": {0: "batch"}},
     )
+    return graph.getvalue()
+
+
+def compile_encoder(
+    encoder: Encoder, image_size: int, dtype: type[np.floating[Any]] = np.float16
+) -> Callable[[NDArray[np.uint8]], NDArray[Any]]:
+    """A frozen encoder as an ONNX Runtime function on one thread.
+
+    Takes (B, frames_per_code, S, S, 3) uint8, returns the codes (B, code) in `dtype`.
+    """
+    import onnxruntime  # heavy, and only processes that encode need it
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(graph.getvalue(), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        export_onnx(encoder, image_size), options, providers=["CPUExecutionProvider"]
+    )
 
-    def encode(frames: NDArray[np.uint8]) -> NDArray[np.float16]:
-        images = _to_channels(torch.from_numpy(frames)).numpy()
+    def encode(frames: NDArray[np.uint8]) -> NDArray[Any]:
+        images = to_channels(torch.from_numpy(frames)).numpy()
         codes: NDArray[np.float32] = session.run(None, {"frames": images})[0]
-        return codes.astype(np.float16)
+        return codes.astype(dtype)
 
     return encode
 

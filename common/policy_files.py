@@ -6,6 +6,7 @@ What the learner writes as checkpoint or snapshot and what evaluation reads.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -18,14 +19,16 @@ from common.errors import UsageError
 CONFIG, NETWORKS = "config.toml", "networks.safetensors"
 
 
-def save_folder(folder: Path, texts: dict[str, str], tensors: dict[str, dict[str, Tensor]]) -> None:
-    """Writes files of text and of tensors into a new folder by way of a temporary name."""
+def save_folder(
+    folder: Path, files: Mapping[str, str | bytes], tensors: dict[str, dict[str, Tensor]]
+) -> None:
+    """Writes files, of text or bytes, and files of tensors into a new folder by way of a temporary name."""
     part = folder.with_name(folder.name + ".part")
     if part.exists():
         shutil.rmtree(part)
     part.mkdir(parents=True)
-    for name, text in texts.items():
-        (part / name).write_text(text, "utf-8")
+    for name, content in files.items():
+        (part / name).write_bytes(content.encode() if isinstance(content, str) else content)
     for name, group in tensors.items():
         # safetensors refuses tensors that share memory, as those of a target network may
         save_file({key: value.detach().clone().contiguous() for key, value in group.items()}, part / name)
@@ -46,14 +49,18 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
         raise UsageError(f"{file} is damaged: {error}") from None
 
 
+def load_config(folder: Path) -> Config:
+    """The configuration in a folder; raises UsageError when it is of another version."""
+    try:
+        return parse((folder / CONFIG).read_text("utf-8"))
+    except UsageError as error:
+        raise UsageError(f"{folder} was made by another version of navaclq: {error}") from None
+
+
 def load_policy(folder: Path) -> tuple[Config, dict[str, Tensor]]:
     """Configuration and networks; raises UsageError when `folder` is no policy, or a damaged one."""
     if not (folder / CONFIG).is_file():
         raise UsageError(
             f"{folder} is no policy: a checkpoint folder with {CONFIG} and {NETWORKS} is expected"
         )
-    try:
-        config = parse((folder / CONFIG).read_text("utf-8"))
-    except UsageError as error:
-        raise UsageError(f"{folder} is a policy of another version of navaclq: {error}") from None
-    return config, load_tensors(folder / NETWORKS)
+    return load_config(folder), load_tensors(folder / NETWORKS)

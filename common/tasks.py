@@ -28,6 +28,8 @@ CORRIDOR_MARGIN = 0.10
 """Free space on either side of the robot on its way under the dolly, m (decided)."""
 CATALOGUE_SIZE = 12
 """Boxes that obstacles are taken from."""
+DRAWS, DISTANCES = 200, 5
+"""Draws of a scene for one distance, and distances that are tried: so they stay uniform whatever fits."""
 GRID_HEADINGS = (0, -45, 45, -90, 90, -135, 135, 180)
 """Degrees (section 4.2)."""
 
@@ -148,11 +150,13 @@ def build_scene(task: Task, world: WorldConfig) -> Scene:
 
     Raises UsageError with the commonest reason when no draw fits.
     """
-    rng, reasons, draws = random_stream(task, 0), Counter[str](), 200
-    distance = 0.0
-    if isinstance(task.start, StartRanges):  # drawn once, so that distances stay uniform whatever fits
-        distance = rng.uniform(task.start.distance_min, task.start.distance_max)
-    for _ in range(draws):
+    rng, reasons = random_stream(task, 0), Counter[str]()
+    distance, draws = 0.0, DRAWS
+    if isinstance(task.start, StartRanges):
+        draws *= DISTANCES
+    for draw in range(draws):
+        if isinstance(task.start, StartRanges) and draw % DRAWS == 0:
+            distance = rng.uniform(task.start.distance_min, task.start.distance_max)
         scene = _draw_scene(task, world, distance, rng)
         if isinstance(scene, Scene):
             return scene
@@ -280,13 +284,18 @@ def random_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
     return Task(cell=cell, seed=int(rng.integers(2**32)), start=config.world.start)
 
 
-def candidate_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
-    """A task for the database: `curriculum.narrowed_candidates` of them from ranges narrowed at random."""
+def narrowed_task(cell: int, config: Config, rng: np.random.Generator, share: float) -> Task:
+    """A task of the training distribution, or with probability `share` from ranges narrowed at random."""
     task = random_task(cell, config, rng)
-    if rng.random() < config.curriculum.narrowed_candidates:
+    if rng.random() < share:
         start = config.curriculum.gate.ranges.towards(config.world.start, float(rng.random()))
         return task.model_copy(update={"start": start})
     return task
+
+
+def candidate_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
+    """A task for the curriculum's database."""
+    return narrowed_task(cell, config, rng, config.curriculum.narrowed_candidates)
 
 
 SUITES = ("short", "train")

@@ -6,28 +6,36 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Literal
 
 from torch import Tensor
 
 from common.config import Config, differing_keys, parse
+from common.encoders import ENCODER, frozen_encoder, pack_encoder
 from common.errors import UsageError
 from common.files import write_atomically
 from common.policy_files import CONFIG, NETWORKS, load_tensors, save_folder
 from learner.sac import SAC
 
-RUN_SCHEMA = 1
+RUN_SCHEMA = 2
 """Version of the run directory's layout."""
 
 
 class RunDirectory:
-    """`runs/NAME`: config.toml, run.json, log/, checkpoints/, snapshots/, tensorboard/."""
+    """`runs/NAME`: config.toml, run.json, encoder.safetensors, log/, checkpoints/, snapshots/, tensorboard/.
 
-    def __init__(self, folder: Path, config: Config | None = None) -> None:
+    A training keeps the encoder that it began with, whatever becomes of the one that its configuration names.
+    """
+
+    def __init__(
+        self, folder: Path, config: Config | None = None, job: Literal["training", "pretraining"] = "training"
+    ) -> None:
         """Opens a run, or with `config` starts one; raises UsageError when the folder is something else."""
         self.folder, self.name = folder, folder.resolve().name
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", self.name):
             raise UsageError(f"run name {self.name!r} may hold letters, digits, _, . and - only, at most 64")
         identity = folder / "run.json"
+        self._job = job
         if identity.exists():
             self.config = self._open(identity, config)
         elif config is None:
@@ -36,14 +44,25 @@ class RunDirectory:
             raise UsageError(f"{folder} is not empty and no run directory; choose another --run")
         else:
             self.config = config
+            encoder = pack_encoder(frozen_encoder(config)) if job == "training" else None
             folder.mkdir(parents=True, exist_ok=True)
             (folder / CONFIG).write_text(config.to_toml(), "utf-8")
-            write_atomically(identity, json.dumps({"schema": RUN_SCHEMA, "epoch": 0}).encode())
+            if encoder is not None:
+                (folder / ENCODER).write_bytes(encoder)
+            write_atomically(identity, json.dumps({"schema": RUN_SCHEMA, "job": job, "epoch": 0}).encode())
+
+    @property
+    def encoder(self) -> bytes:
+        """Weights of the frozen encoder; raises UsageError when they are missing."""
+        try:
+            return (self.folder / ENCODER).read_bytes()
+        except OSError as error:
+            raise UsageError(f"cannot read {self.folder / ENCODER}: {error.strerror}") from None
 
     def _open(self, identity: Path, wanted: Config | None) -> Config:
         try:
             values = json.loads(identity.read_text("utf-8"))
-            schema, _ = values["schema"], int(values["epoch"])
+            schema, job, _ = values["schema"], values.get("job"), int(values["epoch"])
             text = (self.folder / CONFIG).read_text("utf-8")
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(f"run directory {self.folder} is damaged: {error!r}") from None
@@ -52,6 +71,8 @@ class RunDirectory:
                 f"{self.folder} was made by an incompatible version: "
                 f"its run schema is {schema}, this version has {RUN_SCHEMA}"
             )
+        if job != self._job:
+            raise UsageError(f"{self.folder} is the folder of a {job}; choose another --run")
         config = parse(text)
         if wanted is not None and (found := differing_keys(wanted, config)):
             key, asked, has = found[0]

@@ -14,6 +14,7 @@ from torch import Tensor
 from common.config import Config
 from common.networks import Perception, Policy, TwinCritic, load_state, state_of
 from common.observation import ObservationLayout
+from learner.optimizers import load_moments, moments_of
 from learner.replay.buffer import Batch
 
 WATCH_INTERVAL = 10
@@ -167,8 +168,7 @@ class SAC:
         networks["log_alpha"] = self.log_alpha.detach()
         moments: dict[str, Tensor] = {}
         for name, optimizer in self.optimizers.items():
-            for index, slots in optimizer.state_dict()["state"].items():
-                moments |= {f"{name}.{index}.{key}": value for key, value in slots.items()}
+            moments |= moments_of(name, optimizer)
         moments["generator"] = self._generator.get_state()
         return networks, moments
 
@@ -178,16 +178,6 @@ class SAC:
         with torch.no_grad():
             self.log_alpha.copy_(networks["log_alpha"])
         for name, optimizer in self.optimizers.items():
-            state = optimizer.state_dict()
-            state["state"] = {
-                index: {
-                    key: moments[f"{name}.{index}.{key}"].clone()  # load_state_dict keeps what it is given
-                    for key in ("step", "exp_avg", "exp_avg_sq")
-                    if f"{name}.{index}.{key}" in moments
-                }
-                for index in state["param_groups"][0]["params"]
-                if f"{name}.{index}.step" in moments
-            }
-            optimizer.load_state_dict(state)
+            load_moments(name, optimizer, moments)
         self._generator.set_state(moments["generator"])
         self.updates = updates

@@ -19,7 +19,6 @@ from torch.utils.tensorboard import SummaryWriter
 from common.bus import Keys, QueryServer, announce, publish, serve
 from common.contract import check_digest, contract_encoder, make_contract
 from common.delivery import unpack_header
-from common.errors import UsageError
 from common.files import write_atomically
 from common.messages import (
     ENDINGS,
@@ -34,11 +33,12 @@ from common.messages import (
 )
 from common.networks import state_of
 from common.observation import ObservationLayout
+from common.resources import check_memory
 from common.telemetry import Rate, Reporter
 from common.weights import pack
 from learner.checkpoint import RunDirectory
+from learner.log import EpisodeLog
 from learner.replay.buffer import Replay
-from learner.replay.log import EpisodeLog
 from learner.sac import SAC, Losses
 
 log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class LearnerService:
             np.random.default_rng([config.seed, 1]),
         )
         self.sac = SAC(config)
-        self.contract = make_contract(run.name, config)
+        self.contract = make_contract(run.name, config, run.encoder)
         frozen = not config.encoder.end_to_end
         self._frozen = state_of(encoder=contract_encoder(self.contract, config)) if frozen else {}
         self._epoch = run.next_epoch()
@@ -190,16 +190,7 @@ class LearnerService:
         config = self.config
         need = Replay.bytes_needed(config.replay, self.layout, config.world.max_episode_steps)
         log.info("replay of %d transitions takes up to %.2f GB", config.replay.capacity, need / 1e9)
-        try:
-            with open("/proc/meminfo", encoding="ascii") as file:  # noqa: PTH123 - one line each, like open
-                free = next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable"))
-        except (OSError, StopIteration):
-            return
-        if need > free:
-            raise UsageError(
-                f"replay.capacity = {config.replay.capacity} needs {need / 1e9:.1f} GB, "
-                f"{free / 1e9:.1f} GB are free; lower it"
-            )
+        check_memory(f"replay.capacity = {config.replay.capacity}", need, "lower it")
 
     def _restore(self) -> None:
         self.run_directory.restore(self.sac)

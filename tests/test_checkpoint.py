@@ -33,7 +33,7 @@ def names(folder: Path) -> list[str]:
 def test_new_run_has_a_complete_configuration_and_an_identity(tmp_path):
     run = RunDirectory(tmp_path / "runs" / "x", CONFIG)
     assert (run.name, run.config) == ("x", CONFIG)
-    assert names(run.folder) == ["config.toml", "run.json"]
+    assert names(run.folder) == ["config.toml", "encoder.safetensors", "run.json"]
     assert run.folder.joinpath("config.toml").read_text() == CONFIG.to_toml()
     assert run.restore(SAC(CONFIG)) == 0
 
@@ -55,7 +55,7 @@ def test_setting_that_conflicts_with_the_run_is_named(tmp_path):
 def test_run_of_another_schema_is_refused_and_damage_reported(tmp_path):
     identity = RunDirectory(tmp_path / "x", CONFIG).folder / "run.json"
     identity.write_text(json.dumps({"schema": 99, "epoch": 0}))
-    with pytest.raises(UsageError, match="incompatible version: its run schema is 99, this version has 1"):
+    with pytest.raises(UsageError, match="incompatible version: its run schema is 99, this version has 2"):
         RunDirectory(tmp_path / "x", CONFIG)
     for damage in ("", "{", "[]", "{}", "3"):
         identity.write_text(damage)
@@ -93,7 +93,7 @@ def test_epoch_counts_every_start_and_outlives_the_process(tmp_path):
     assert [run.next_epoch(), run.next_epoch()] == [1, 2]
     assert RunDirectory(tmp_path / "x").next_epoch() == 3
     assert RunDirectory(tmp_path / "x", CONFIG).next_epoch() == 4
-    assert names(run.folder) == ["config.toml", "run.json"]
+    assert names(run.folder) == ["config.toml", "encoder.safetensors", "run.json"]
 
 
 def test_newest_checkpoints_are_kept_and_the_newest_is_restored(tmp_path):

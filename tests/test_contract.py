@@ -10,11 +10,13 @@ from common.contract import (
     digest,
     make_contract,
 )
+from common.encoders import pack_encoder
 from common.errors import UsageError
 from common.messages import ContractReply, MessageError, decode, encode
 from common.networks import make_encoder
 
 CONFIG = resolve("smoke", seed=3)
+ENCODER = pack_encoder(make_encoder(CONFIG))
 ALL_FIELDS = {"protocol", "encoder", "observation", "dynamics", "reward"}
 
 
@@ -122,7 +124,7 @@ def test_equal_digests_pass_and_the_first_difference_is_named():
 
 
 def test_encoder_arrives_to_the_bit_through_the_contract():
-    contract = decode(ContractReply, encode(make_contract("run-1", CONFIG)))
+    contract = decode(ContractReply, encode(make_contract("run-1", CONFIG, ENCODER)))
     assert contract.run == "run-1"
     config = accept_contract(contract)
     assert config == CONFIG
@@ -132,7 +134,7 @@ def test_encoder_arrives_to_the_bit_through_the_contract():
 
 
 def test_encoder_comes_from_the_contract_and_not_from_the_seed():
-    contract = make_contract("r", CONFIG)
+    contract = make_contract("r", CONFIG, ENCODER)
     other = resolve("smoke", seed=CONFIG.seed + 1)
     expected = make_encoder(CONFIG).state_dict()
     found = contract_encoder(contract, other).state_dict()
@@ -140,7 +142,9 @@ def test_encoder_comes_from_the_contract_and_not_from_the_seed():
 
 
 def test_local_overrides_that_keep_the_contract_are_taken():
-    config = accept_contract(make_contract("r", CONFIG), ("actor.worlds=7", "world.max_evaluation_steps=9"))
+    config = accept_contract(
+        make_contract("r", CONFIG, ENCODER), ("actor.worlds=7", "world.max_evaluation_steps=9")
+    )
     assert config.actor.worlds == 7
     assert config.world.max_evaluation_steps == 9
     assert config.sac == CONFIG.sac
@@ -180,26 +184,26 @@ def test_local_overrides_that_keep_the_contract_are_taken():
 )
 def test_override_that_breaks_the_contract_is_refused_with_its_key(settings, said):
     with pytest.raises(UsageError) as caught:
-        accept_contract(make_contract("r", CONFIG), settings)
+        accept_contract(make_contract("r", CONFIG, ENCODER), settings)
     assert str(caught.value) == said
 
 
 def test_contract_of_another_protocol_is_refused():
-    contract = make_contract("r", CONFIG)
+    contract = make_contract("r", CONFIG, ENCODER)
     newer = contract.model_copy(update={"digest": {**contract.digest, "protocol": "999"}})
     with pytest.raises(UsageError, match="refused by run 'r': protocol differs"):
         accept_contract(newer)
 
 
 def test_contract_with_unknown_settings_of_another_version_is_refused():
-    contract = make_contract("r", CONFIG)
+    contract = make_contract("r", CONFIG, ENCODER)
     newer = contract.model_copy(update={"config": contract.config + "\n[novelty]\nx = 1\n"})
     with pytest.raises(UsageError, match="config key 'novelty' does not exist"):
         accept_contract(newer)
 
 
 def test_tampered_encoder_weights_are_refused():
-    contract = make_contract("r", CONFIG)
+    contract = make_contract("r", CONFIG, ENCODER)
     blob = bytearray(contract.encoder)
     blob[-1] ^= 1
     with pytest.raises(UsageError, match="refused by run 'r': encoder differs"):
@@ -209,10 +213,10 @@ def test_tampered_encoder_weights_are_refused():
 @pytest.mark.parametrize("preset", ["paper", "fast"])
 def test_encoder_of_another_shape_is_a_usage_error(preset):
     with pytest.raises(UsageError, match=r"the run's encoder does not fit: tensor encoder\.blocks"):
-        contract_encoder(make_contract("r", CONFIG), resolve(preset))
+        contract_encoder(make_contract("r", CONFIG, ENCODER), resolve(preset))
 
 
 def test_encoder_that_is_no_safetensors_is_a_usage_error():
-    contract = make_contract("r", CONFIG).model_copy(update={"encoder": b"junk"})
+    contract = make_contract("r", CONFIG, ENCODER).model_copy(update={"encoder": b"junk"})
     with pytest.raises(UsageError, match="the run's encoder does not fit"):
         contract_encoder(contract, CONFIG)

@@ -12,6 +12,7 @@ from common.bus import Keys, QueryServer, RefusedError, ask, ask_bytes, open_cli
 from common.config import Config
 from common.contract import make_contract
 from common.delivery import Sender, Spool, pack_header
+from common.encoders import pack_encoder
 from common.errors import UsageError
 from common.messages import (
     Acknowledgement,
@@ -26,6 +27,7 @@ from common.messages import (
     decode,
     encode,
 )
+from common.networks import make_encoder
 from common.weights import pack
 from curriculum.service import CurriculumService
 from deploy.cli.main import app
@@ -34,9 +36,10 @@ from tests.helpers import small_config, wait_until
 from tests.test_curriculum import make_candidate
 
 CONFIG = small_config("curriculum.gate.window=4")
+ENCODER = pack_encoder(make_encoder(CONFIG))
 OPEN = small_config("curriculum.gate.enabled=false")
 KEYS = Keys("run-1")
-DIGEST = make_contract("run-1", CONFIG).digest
+DIGEST = make_contract("run-1", CONFIG, ENCODER).digest
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from common.messages import Episode, Origin, decode, encode
-from learner.replay.log import EpisodeLog, Record
+from learner.log import EpisodeLog, Record
 from tests.helpers import small_config, tiny_episode
 
 CAPACITY = 1000

@@ -80,6 +80,7 @@ MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
         last_version=versions,
         category=texts,
     ),
+    m.Frames: st.builds(m.Frames, digest=digests, task=tasks, frame=arrays, mask=arrays, goal=arrays),
     m.TaskQuery: st.builds(m.TaskQuery, cell=st.integers(0, 8), t=counts, count=st.integers(1, 1000)),
     m.Proposal: proposals,
     m.Proposals: st.builds(m.Proposals, tasks=st.lists(proposals, max_size=3)),
@@ -97,7 +98,12 @@ MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
     m.Candidates: st.builds(m.Candidates, digest=digests, candidates=st.lists(candidates, max_size=3)),
     m.WeightsBlob: st.builds(m.WeightsBlob, version=versions, sha256=texts, blob=st.binary()),
     m.ContractReply: st.builds(
-        m.ContractReply, run=names, config=st.text(), encoder=st.binary(), digest=digests
+        m.ContractReply,
+        run=names,
+        config=st.text(),
+        encoder=st.binary(),
+        digest=digests,
+        job=st.sampled_from(["training", "pretraining"]),
     ),
     m.Stat: st.builds(
         m.Stat,

@@ -57,5 +57,5 @@ def test_a_policy_of_another_version_is_named(tmp_path):
     text = SETTINGS.to_toml()
     assert "version = 2\n" in text
     save_folder(tmp_path / "x", {CONFIG: text.replace("version = 2\n", "version = 1\n")}, {NETWORKS: TENSORS})
-    with pytest.raises(UsageError, match=r"x is a policy of another version of navaclq: .*world\.version"):
+    with pytest.raises(UsageError, match=r"x was made by another version of navaclq: .*world\.version"):
         load_policy(tmp_path / "x")

@@ -568,16 +568,30 @@ def test_shift_into_a_wall_or_to_where_none_can_dock_is_refused(shift, reason):
 def test_impossible_request_is_a_usage_error_that_names_the_reason(cell, start, settings, said):
     with pytest.raises(UsageError) as caught:
         build_scene(Task(cell=cell, seed=1, start=start), resolve(overrides=settings).world)
-    assert str(caught.value) == f"no free start in {said} in 200 of 200 draws"
+    draws = 200 if isinstance(start, PlacedStart) else 1000
+    assert str(caught.value) == f"no free start in {said} in {draws} of {draws} draws"
+
+
+def test_a_distance_at_which_nothing_fits_gives_way_to_another():
+    ranges = StartRanges(distance_min=0.8, distance_max=4.0, yaw=90.0)
+    tasks = [Task(cell=0, seed=seed, start=ranges) for seed in range(2**20, 2**20 + 200)]
+    # a robot so near must stand straight between the legs, which one draw in hundreds does
+    first = [random_stream(task, 0).uniform(0.8, 4.0) for task in tasks]
+    near = [(task, distance) for task, distance in zip(tasks, first, strict=True) if distance < 0.9]
+    scenes = [build_scene(task, WORLD) for task, _ in near]
+    found = [math.hypot(scene.dolly.x - scene.robot.x, scene.dolly.y - scene.robot.y) for scene in scenes]
+    kept = [distance == pytest.approx(drawn) for distance, (_, drawn) in zip(found, near, strict=True)]
+    assert any(kept)
+    assert not all(kept)
 
 
 def test_commonest_reason_is_the_one_that_is_named():
     ranges = StartRanges(jitter=4.0, distance_min=14.0, distance_max=14.0)  # a third of the robots do not fit
-    said = r"cell 6 \(deep aisle\) at a distance of 14\.00 m: the dolly stands .* in \d+ of 200 draws"
+    said = r"cell 6 \(deep aisle\) at a distance of 14\.00 m: the dolly stands .* in \d+ of 1000 draws"
     with pytest.raises(UsageError, match=said) as caught:
         build_scene(Task(cell=6, seed=1, start=ranges), WORLD)
-    count = int(str(caught.value).split(" of 200")[0].split()[-1])
-    assert 100 < count < 160
+    count = int(str(caught.value).split(" of 1000")[0].split()[-1])
+    assert 500 < count < 800
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +94,16 @@ class Camera:
 
     def sense(self, pose: SE2, rng: np.random.Generator) -> NDArray[np.uint8]:
         """(size, size, 3) RGB image; `rng` chooses the noise."""
-        image = self._render(self.view(pose), self._light)
+        return self._add_noise(self._render(self.view(pose), self._light), rng)
+
+    def sense_bodies(
+        self, pose: SE2, rng: np.random.Generator
+    ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+        """The image, and (size, size) which body each pixel shows: its id, -1 for none."""
+        image, bodies = self._render.bodies(self.view(pose), self._light)
+        return self._add_noise(image, rng), bodies
+
+    def _add_noise(self, image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
         if self._noise is None:
             return image
         first = int(rng.integers(len(self._normal) - image.size + 1))
@@ -118,12 +128,20 @@ class Renderer:
             "shadow": 0,
             "lightSpecularCoeff": 0.0,
             "renderer": bullet.ER_TINY_RENDERER,
-            "flags": bullet.ER_NO_SEGMENTATION_MASK,
         }
+        self._no_bodies = bullet.ER_NO_SEGMENTATION_MASK
 
     def __call__(self, view: tuple[float, ...], light: Light) -> NDArray[np.uint8]:
         """(size, size, 3) RGB image."""
-        image = self._take(
+        return self._shoot(view, light, self._no_bodies)[0]
+
+    def bodies(self, view: tuple[float, ...], light: Light) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+        """The image, and (size, size) ids of the bodies that its pixels show; -1 for none."""
+        image, ids = self._shoot(view, light, 0)
+        return image, np.asarray(ids, np.int32).reshape(self._size, self._size)
+
+    def _shoot(self, view: tuple[float, ...], light: Light, flags: int) -> tuple[NDArray[np.uint8], Any]:
+        _, _, image, _, ids = self._take(
             self._size,
             self._size,
             view,
@@ -132,10 +150,11 @@ class Renderer:
             lightColor=light.color,
             lightAmbientCoeff=light.ambient,
             lightDiffuseCoeff=light.diffuse,
+            flags=flags,
             **self._constant,
-        )[2]
+        )
         rgba = np.asarray(image, np.uint8).reshape(self._size, self._size, 4)
         rgb = np.empty((self._size, self._size, 3), np.uint8)
         for channel in range(3):  # twice as fast as slicing all three
             rgb[..., channel] = rgba[..., channel]
-        return rgb
+        return rgb, ids

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from common.errors import UsageError
+from deploy.bench.report import Report
 from deploy.cli import options
 
 app = typer.Typer(help="Measure parts against their rivals and limits.", no_args_is_help=True)
@@ -15,6 +18,33 @@ app = typer.Typer(help="Measure parts against their rivals and limits.", no_args
 @app.callback()
 def _group() -> None:
     """Measure parts against their rivals and limits, all in one run; ratios, higher is better."""
+
+
+@app.command()
+def encoder(
+    frames: Annotated[Path, typer.Option(help="Folder of frames that `navaclq pretrain` has gathered.")],
+    epochs: Annotated[int, typer.Option(min=1, help="Epochs for each size.")] = 4,
+    preset: options.Preset = None,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+) -> None:
+    """Sizes of the image encoder: what linear probes read in the validation arena against time per frame."""
+    chosen = [*(settings or ()), f"pretraining.epochs={epochs}"]
+    resolved = options.configuration(preset, None, config, chosen, seed)
+    from deploy.bench.encoder import SIZES, bench_encoder
+    from deploy.pretraining import film_probes
+    from learner.pretraining.frame_store import FrameStore
+
+    store = FrameStore(frames, resolved)
+    if not store.complete:
+        raise UsageError(f"{frames} holds {store.sequences} sequences; `navaclq pretrain` gathers the rest")
+    with options.progress("drives filmed", 3 * resolved.pretraining.probe_drives) as done:
+        tables = film_probes(resolved, done)
+    with options.progress("sizes", len(SIZES)) as report:
+        found = bench_encoder(resolved, store, tables, report)
+    _print(found, as_json)
 
 
 @app.command()
@@ -35,6 +65,10 @@ def sim(
 
     with options.progress("rounds", rounds) as done:
         report = bench_sim(resolved, rounds, soak, done)
+    _print(report, as_json)
+
+
+def _print(report: Report, as_json: bool) -> None:
     if as_json:
         options.print_json(report.to_json())
     else:

@@ -10,7 +10,7 @@ from typer.exceptions import TyperException
 from common.bus import NoAnswerError, RefusedError
 from common.errors import UsageError
 from common.messages import MessageError
-from deploy.cli import bench, config, curriculum, doctor, evaluate, processes, train, world
+from deploy.cli import bench, config, curriculum, doctor, evaluate, pretrain, processes, train, world
 
 app = typer.Typer(
     name="navaclq",
@@ -20,6 +20,7 @@ app = typer.Typer(
     help="Train mobile robots to dock from camera and LiDAR: distributed SAC with an automatic curriculum.",
 )
 app.command("train")(train.train)
+app.command("pretrain")(pretrain.pretrain)
 app.command("learner")(processes.learner)
 app.command("actor")(processes.actor)
 app.command("evaluate")(evaluate.evaluate)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TextColumn
 
 from common.cells import ROOM_NAMES, check_cell
 from common.config import Config, resolve
@@ -62,6 +64,7 @@ Shift = Annotated[
     typer.Option(help="Move the dolly after STEP control steps by X,Y,YAW (m, m, degrees): STEP,X,Y,YAW."),
 ]
 
+LINE_SECONDS = 10.0
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
@@ -136,12 +139,35 @@ def write_picture(file: Path, picture: Image.Image) -> None:
     write_file(file, content.getvalue())
 
 
+class Report(Protocol):
+    """Hears how much of something is done, and maybe more about it."""
+
+    def __call__(self, done: int, note: str = "") -> None:
+        """Shows it."""
+
+
 @contextmanager
-def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr, where that is a terminal; the function takes how much is done."""
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        row = bar.add_task(label, total=total)
-        yield lambda done: bar.update(row, completed=done)
+def progress(label: str, total: int) -> Iterator[Report]:
+    """A bar on stderr with the time left; where that is no terminal, a line every ten seconds."""
+    console, began = Console(stderr=True), time.monotonic()
+    said = began
+    columns = (*Progress.get_default_columns(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        row = bar.add_task(label, total=total, note="")
+        first: int | None = None
+
+        def report(done: int, note: str = "") -> None:
+            nonlocal said, first
+            first = done if first is None else first
+            bar.update(row, completed=done, note=note)
+            now = time.monotonic()
+            if not console.is_terminal and now - said >= LINE_SECONDS:
+                said = now
+                left = (total - done) * (now - began) / 60 / (done - first) if done > first else math.inf
+                rest = f", {left:.1f} min left" if left < math.inf else ""
+                sys.stderr.write(f"{label}: {done} of {total}{rest}{'; ' if note else ''}{note}\n")
+
+        yield report
 
 
 def print_json(value: dict[str, Any]) -> None:

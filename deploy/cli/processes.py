@@ -78,6 +78,7 @@ def actor(
     if count > 1:
         _start_many(count, name)
         return
+    from actor.frames import FrameService
     from actor.service import ActorService
     from common.contract import accept_contract, fetch_contract
 
@@ -88,8 +89,9 @@ def actor(
         resolved = accept_contract(contract, tuple(settings or ()))
         spools = spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run
         own, lock = claim_name(spools, name)
-        service = ActorService(session, contract, resolved, own, spools / own, chosen)
-        log.info("actor %s drives %d worlds for run %r", own, resolved.actor.worlds, contract.run)
+        kind = ActorService if contract.job == "training" else FrameService
+        service = kind(session, contract, resolved, own, spools / own, chosen)
+        log.info("actor %s drives %d worlds for run %r", own, service.worlds, contract.run)
         try:
             service.run()
         finally:

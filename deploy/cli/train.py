@@ -13,7 +13,9 @@ import typer
 
 from common.bus import Keys, open_client
 from common.config import parse, resolve
+from common.contract import fetch_contract
 from common.errors import UsageError
+from common.messages import ContractReply
 from common.tasks import suite as suite_tasks
 from common.telemetry import exit_on_signals
 from deploy.cli import options
@@ -102,8 +104,10 @@ def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[
             screen = Screen(monitor, f"navaclq train {run}")
             for event in early:
                 screen.say(event)
+            contract = fetch_contract(session, lambda waited: supervisor.check())
             screen.say(
-                f"training into {run} for {minutes:g} min with {count} actor process(es), hub {address}"
+                f"training into {run} for {minutes:g} min with {count} actor process(es), hub {address}, "
+                f"{_describe_encoder(contract)}"
             )
             while not main.finished:
                 supervisor.check()
@@ -115,6 +119,13 @@ def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[
         if screen:
             screen.close()
         supervisor.stop()
+
+
+def _describe_encoder(contract: ContractReply) -> str:
+    encoder = parse(contract.config).encoder
+    if encoder.end_to_end:
+        return "encoder trained end to end"
+    return f"frozen encoder {encoder.weights} ({contract.digest['encoder']})"
 
 
 class _Clock:
@@ -141,6 +152,7 @@ def _summary(run: Path, load: float) -> dict[str, Any]:
         "seed": config.seed,
         "preset": config.preset,
         "variant": config.variant,
+        "encoder": "end to end" if config.encoder.end_to_end else config.encoder.weights,
         "minutes": learned["minutes"],
         "env_steps": learned["env_steps"],
         "episodes": learned["episodes"],

@@ -1,0 +1,30 @@
+"""Optimisers as flat dictionaries of tensors, so that they can be kept without pickle."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.optim import Optimizer
+
+
+def moments_of(name: str, optimizer: Optimizer) -> dict[str, Tensor]:
+    """The state of Adam, `name.parameter.key`."""
+    return {
+        f"{name}.{index}.{key}": value
+        for index, slots in optimizer.state_dict()["state"].items()
+        for key, value in slots.items()
+    }
+
+
+def load_moments(name: str, optimizer: Optimizer, moments: dict[str, Tensor]) -> None:
+    """Takes what `moments_of` gave; parameters that it does not name begin anew."""
+    state = optimizer.state_dict()
+    state["state"] = {
+        index: {
+            key: moments[f"{name}.{index}.{key}"].clone()  # load_state_dict keeps what it is given
+            for key in ("step", "exp_avg", "exp_avg_sq")
+            if f"{name}.{index}.{key}" in moments
+        }
+        for index in state["param_groups"][0]["params"]
+        if f"{name}.{index}.step" in moments
+    }
+    optimizer.load_state_dict(state)

@@ -1,0 +1,1 @@
+"""Pre-training of the image encoder: frames on disk, objectives, training, linear probes."""

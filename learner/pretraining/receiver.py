@@ -1,0 +1,47 @@
+"""The receiving end of a pre-training on the bus: serves the contract and takes frames in."""
+
+from __future__ import annotations
+
+import zenoh
+
+from common.bus import Keys, QueryServer, serve
+from common.contract import check_digest, digest
+from common.delivery import unpack_header
+from common.messages import Acknowledgement, ContractReply, Frames, Message, Nothing, decode, encode
+from learner.pretraining.frame_store import FrameStore
+
+
+class FrameReceiver:
+    """Takes drives from actors into a store, each acknowledged when it is on disk, until closed."""
+
+    def __init__(self, session: zenoh.Session, name: str, store: FrameStore) -> None:
+        self._store, config = store, store.config
+        self.failure: OSError | None = None
+        """Why the store could not be written to."""
+        self.contract = ContractReply(
+            run=name, config=config.to_toml(), encoder=b"", digest=digest(config, b""), job="pretraining"
+        )
+        keys = Keys(name)
+        self._servers = [
+            QueryServer(session, keys.frames, self._take),
+            serve(session, keys.contract, Nothing, self._answer_contract),
+        ]
+
+    def _take(self, payload: bytes, attachment: bytes) -> bytes:
+        origin = unpack_header(attachment, payload)
+        message = decode(Frames, payload)
+        check_digest(self.contract.digest, message.digest)
+        try:
+            new = self._store.add(origin, message, payload)
+        except OSError as error:
+            self.failure = error
+            raise
+        return encode(Acknowledgement(duplicate=not new))
+
+    def _answer_contract(self, question: Message) -> ContractReply:
+        return self.contract
+
+    def close(self) -> None:
+        """Stops taking."""
+        for server in self._servers:
+            server.close()
