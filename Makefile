@@ -6,7 +6,7 @@ endif
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: setup train test test-slow format clean
+.PHONY: setup train test test-slow encoders format clean
 
 setup: .venv/.installed
 
@@ -26,6 +26,12 @@ test: setup
 
 test-slow: setup
 	$(BIN)/pytest -m slow --timeout 3600 $(ARGS)
+
+# Both shipped encoders from nothing: about 20 minutes and two hours on two cores.
+encoders: setup
+	$(BIN)/navaclq pretrain --run runs/eyes-fast --frames runs/frames --seed 1 --out common/encoders/fast
+	$(BIN)/navaclq pretrain --run runs/eyes-paper --frames runs/frames --seed 1 --preset paper --epochs 10 \
+		--out common/encoders/paper
 
 format: setup
 	$(BIN)/ruff check --fix .

@@ -31,10 +31,10 @@ class EncoderConfig(Section):
     """`residual` is the paper's (figure of the ResNet blocks); `light` is four times cheaper per frame."""
     frames_per_code: Literal[1, 4] = 1
     """4: one code of the 12-channel stack per step (paper); 1: one code per frame, four stacked by index."""
-    channels: tuple[Count, Count, Count, Count] = (16, 16, 32, 4)
+    channels: tuple[Count, Count, Count, Count] = (16, 32, 64, 4)
     end_to_end: bool = False
     """True trains the encoder with the critic from uint8 frames, from random weights; False freezes it."""
-    weights: Annotated[str, Field(min_length=1)] = "random"
+    weights: Annotated[str, Field(min_length=1)] = "fast"
     """Of a frozen encoder: one that is shipped (`fast`, `paper`), `random` at its seeded initialisation, or
     the folder of one that `navaclq pretrain` made."""
 
@@ -50,7 +50,7 @@ class PretrainingConfig(Section):
     """Control steps of a drive, unless a contact ends it before (decided)."""
     near_share: Fraction = 0.5
     """Share of drives that start in ranges narrowed towards `curriculum.gate.ranges` (decided)."""
-    epochs: Count = 10
+    epochs: Count = 15
     batch_size: Count = 128
     learning_rate: Positive = 1e-3
     """Of Adam, at the start."""
@@ -60,6 +60,8 @@ class PretrainingConfig(Section):
     """Weight of the dolly mask's cross-entropy against the pixels' squared error; `semantic` only."""
     pose_weight: NotNegative = 0.1
     """Weight of visibility, bearing, distance and relative yaw; `semantic` only."""
+    mirror: bool = True
+    """Whether half of the samples are seen in a mirror (decided)."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     """Of the products; on a CPU with AMX bfloat16 is four times as fast, on an old one slower."""
     probe_drives: Annotated[int, Field(ge=9)] = 900

@@ -11,8 +11,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from common.bus import check_endpoint
 from common.config import Config
-from common.encoders import encoder_folder
+from common.encoders import RANDOM, encoder_folder
 from common.telemetry import exit_on_signals
 from deploy.cli import options
 from deploy.launcher import free_port
@@ -59,9 +60,11 @@ def pretrain(
     actors: Annotated[
         int | None, typer.Option(min=0, max=256, help="Actor processes; default: one per core.")
     ] = None,
-    port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="TCP port of the hub; default: a free one.")
+    listen: Annotated[
+        str | None,
+        typer.Option(help="Endpoint for actors of other hosts to join; default: a free port on loopback."),
     ] = None,
+    insecure: options.Insecure = False,
     preset: options.Preset = None,
     config: options.ConfigFile = None,
     settings: options.Settings = None,
@@ -73,10 +76,10 @@ def pretrain(
         result = _examine(encoder_folder(examined))
         result = {"encoder": examined, **result}
     else:
+        address = check_endpoint(listen or f"tcp/127.0.0.1:{free_port()}", insecure)
         given = {"objective": objective, "sequences": sequences, "epochs": epochs}
         extra = [f"pretraining.{key}={value}" for key, value in given.items() if value is not None]
         directory = _open(run, preset, config, [*(settings or ()), *extra], seed)
-        address = f"tcp/127.0.0.1:{port or free_port()}"
         result = _pretrain(directory, out, frames, actors, address)
     if as_json:
         options.print_json(result)
@@ -92,7 +95,8 @@ def _open(
 
     wanted = None
     if not (run / "run.json").exists() or any((preset, file, settings, seed is not None)):
-        wanted = options.configuration(preset, None, file, settings, seed)
+        begin = f"encoder.weights={RANDOM}"  # whatever the preset trains with
+        wanted = options.configuration(preset, None, file, [*settings, begin], seed)
     directory = RunDirectory(run, wanted, "pretraining")
     return directory.folder, directory.name, directory.config
 

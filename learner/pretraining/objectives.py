@@ -18,6 +18,9 @@ from common.networks import Encoder, to_channels
 HEADS = 5
 """Visibility (logit), bearing (rad), distance (m), sine and cosine of twice the relative yaw."""
 
+POSE_SCALES = (4.0, 1.0, 2.0, 2.0)
+"""Factors of the heads but the first that bring what they tell to a standard deviation of about 1."""
+
 
 class Batch(NamedTuple):
     """B samples."""
@@ -30,6 +33,16 @@ class Batch(NamedTuple):
     """(B,) float32, 1 where it shows enough of it."""
     pose: Tensor
     """(B, 4) float32: the targets of the heads but the first."""
+
+    def mirrored(self, which: Tensor) -> Batch:
+        """The same with the samples that `which` (B,) bool names seen in a mirror: left is right."""
+        flips = torch.tensor([-1.0, 1.0, -1.0, 1.0])
+        return Batch(
+            torch.where(which[:, None, None, None], self.images.flip(-1), self.images),
+            torch.where(which[:, None, None], self.mask.flip(-1), self.mask),
+            self.visible,
+            torch.where(which[:, None], self.pose * flips, self.pose),
+        )
 
 
 class Losses(NamedTuple):
@@ -134,7 +147,8 @@ class Pretraining(nn.Module):
         config, seen = self.config, batch.visible
         of_mask = F.binary_cross_entropy_with_logits(mask, batch.mask)
         of_visible = F.binary_cross_entropy_with_logits(heads[:, 0], seen)
-        errors = F.smooth_l1_loss(heads[:, 1:], batch.pose, reduction="none", beta=0.1).sum(1)
+        scale = torch.tensor(POSE_SCALES)
+        errors = F.smooth_l1_loss(heads[:, 1:] * scale, batch.pose * scale, reduction="none", beta=0.1).sum(1)
         of_pose = (errors * seen).sum() / seen.sum().clamp(min=1.0)
         total = pixels + config.mask_weight * of_mask + config.pose_weight * (of_visible + of_pose)
         return Losses(total, pixels, of_mask, of_visible, of_pose)

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import zenoh
 
-from common.bus import Keys, QueryServer, serve
+from common.bus import BUSY, Keys, QueryServer, serve
 from common.contract import check_digest, digest
 from common.delivery import unpack_header
-from common.messages import Acknowledgement, ContractReply, Frames, Message, Nothing, decode, encode
+from common.messages import (
+    Acknowledgement,
+    ContractReply,
+    Frames,
+    Message,
+    MessageError,
+    Nothing,
+    decode,
+    encode,
+)
 from learner.pretraining.frame_store import FrameStore
 
 
@@ -35,7 +44,7 @@ class FrameReceiver:
             new = self._store.add(origin, message, payload)
         except OSError as error:
             self.failure = error
-            raise
+            raise MessageError(BUSY) from None  # the sender keeps it, should there be a next time
         return encode(Acknowledgement(duplicate=not new))
 
     def _answer_contract(self, question: Message) -> ContractReply:

@@ -23,7 +23,7 @@ from common.networks import load_state, make_encoder, state_of
 from common.policy_files import CONFIG, load_tensors, save_folder
 from learner.optimizers import load_moments, moments_of
 from learner.pretraining.figure import reconstruction_figure
-from learner.pretraining.objectives import Losses, Pretraining, Sampler
+from learner.pretraining.objectives import Batch, Losses, Pretraining, Sampler
 
 CODE_RMS = 0.5
 """Root mean square of an exported encoder's codes: about that of LiDAR readings."""
@@ -107,7 +107,11 @@ class Trainer:
         span = own.learning_rate - own.final_learning_rate
         for group in self._optimizer.param_groups:
             group["lr"] = own.final_learning_rate + span * (1 + math.cos(math.pi * part)) / 2
-        losses = self._losses(rows)
+        batch = self._sampler(rows)
+        if own.mirror:
+            coins = np.random.default_rng([self.config.seed, 9, self.done]).random(len(rows)) < 0.5
+            batch = batch.mirrored(torch.from_numpy(coins))
+        losses = self._losses(batch)
         if not math.isfinite(losses.total.item()):
             raise ArithmeticError(f"the loss is not finite at batch {self.done}")
         self._optimizer.zero_grad()
@@ -115,8 +119,7 @@ class Trainer:
         self._optimizer.step()
         return np.array([loss.item() for loss in losses])
 
-    def _losses(self, rows: NDArray[np.int64]) -> Losses:
-        batch = self._sampler(rows)
+    def _losses(self, batch: Batch) -> Losses:
         batch = batch._replace(images=batch.images.contiguous(memory_format=torch.channels_last))
         low = self.config.pretraining.precision == "bfloat16"
         with torch.autocast("cpu", torch.bfloat16, enabled=low):
@@ -127,7 +130,7 @@ class Trainer:
         """Mean losses on held-out drives, in the precision of the training."""
         rows = self.held_rows[:: max(1, len(self.held_rows) // SAMPLE)]
         with torch.inference_mode():
-            table = [[loss.item() for loss in self._losses(part)] for part in _parts(rows)]
+            table = [[loss.item() for loss in self._losses(self._sampler(part))] for part in _parts(rows)]
         return dict(zip(Losses._fields, np.mean(table, axis=0).tolist(), strict=True))
 
     def figure(self, sequences: int, scale: int = 2) -> NDArray[np.uint8]:
