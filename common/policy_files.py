@@ -50,9 +50,11 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
 
 
 def load_config(folder: Path) -> Config:
-    """The configuration in a folder; raises UsageError when it is of another version."""
+    """The configuration in a folder; raises UsageError when it is damaged or of another version."""
     try:
         return parse((folder / CONFIG).read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{folder / CONFIG} is damaged: {error}") from None
     except UsageError as error:
         raise UsageError(f"{folder} was made by another version of navaclq: {error}") from None
 

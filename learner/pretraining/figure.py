@@ -31,10 +31,13 @@ def reconstruction_figure(
             frames = decoded.unflatten(1, (-1, 3)).flatten(0, 1).permute(0, 2, 3, 1)
             lines = [stack, (255 * frames.clamp(0, 1)).round().byte().numpy()]
             if model.semantic:
-                mask = (255 * torch.sigmoid(logits)).round().byte().numpy()
-                lines.append(np.repeat(mask[..., None], 3, axis=-1))
+                masks = np.zeros(stack.shape, np.uint8)  # black where a code has but one mask for its frames
+                each = model.encoder.frames_per_code
+                masks[each - 1 :: each] = (255 * torch.sigmoid(logits)).round().byte().numpy()[..., None]
+                lines.append(masks)
             block = np.concatenate([np.concatenate(list(line), axis=1) for line in lines])
             blocks.append(np.pad(block, ((0, GAP), (0, GAP), (0, 0)), constant_values=255))
+    blocks += [np.full_like(blocks[0], 255)] * (-len(blocks) % columns)
     lines = [np.concatenate(blocks[i : i + columns], axis=1) for i in range(0, len(blocks), columns)]
     sheet = np.concatenate(lines)[:-GAP, :-GAP]
     return np.repeat(np.repeat(sheet, scale, axis=0), scale, axis=1)

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import Config, differing_keys, parse
+from common.config import Config, differing_keys
 from common.errors import UsageError
 from common.files import write_atomically
 from common.frames import Film, FrameTable
 from common.messages import Frames, Origin, decode
+from common.policy_files import CONFIG, load_config
 from common.resources import check_disk
 from learner.log import EpisodeLog
 
@@ -43,11 +44,12 @@ class FrameStore:
         self._check_config()
         self._check_shards()
         size = config.world.camera.size
-        need = (config.pretraining.sequences - self.sequences) * size * size * 25 / 8
-        check_disk(folder, "pretraining.sequences", max(0.0, need), "lower it or choose another --frames")
+        need = config.pretraining.sequences * size * size * 25 / 8
+        need -= sum(path.stat().st_size for path in self._shards())
+        check_disk(folder, "pretraining.sequences", need, "lower it or choose another --frames")
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / "config.toml").exists():
-            write_atomically(folder / "config.toml", config.to_toml().encode())
+        if not (folder / CONFIG).exists():
+            write_atomically(folder / CONFIG, config.to_toml().encode())
         self._log = EpisodeLog(folder, 2**62, SHARD_BYTES)
         if not self.complete:
             self._manifest.unlink(missing_ok=True)  # it will not hold any longer
@@ -78,7 +80,7 @@ class FrameStore:
     def seal(self) -> None:
         """Closes the shards and writes the manifest."""
         self._log.close()
-        shards = [{"file": path.name, "sha256": _sha256(path)} for path in sorted(self.folder.glob("*.log"))]
+        shards = [{"file": path.name, "sha256": _sha256(path)} for path in self._shards()]
         manifest = {
             "schema": STORE_SCHEMA,
             "sequences": self.sequences,
@@ -107,17 +109,21 @@ class FrameStore:
         table = FrameTable.of(films(), rows, size)
         return table, np.array(held[:rows])
 
+    def _shards(self) -> list[Path]:
+        return sorted(self.folder.glob("*.log"))
+
     def _count(self, frames: int) -> None:
         self.sequences += frames
         self.drives += 1
 
     def _check_config(self) -> None:
-        file = self.folder / "config.toml"
-        if not file.exists():
-            if self.folder.exists() and any(self.folder.iterdir()):
+        if self.folder.is_file():
+            raise UsageError(f"{self.folder} is a file; choose another --frames")
+        if not (self.folder / CONFIG).exists():
+            if self.folder.exists() and any(path.suffix != ".part" for path in self.folder.iterdir()):
                 raise UsageError(f"{self.folder} is not empty and holds no frames; choose another --frames")
             return
-        found = differing_keys(self.config, parse(file.read_text("utf-8")), FIXED)
+        found = differing_keys(self.config, load_config(self.folder), FIXED)
         if found:
             key, asked, has = found[0]
             raise UsageError(
@@ -139,17 +145,17 @@ class FrameStore:
             ) from None
         if schema != STORE_SCHEMA:
             raise UsageError(f"{self._manifest} has schema {schema}, this version has {STORE_SCHEMA}")
-        missing = [name for name in shards if not (self.folder / name).is_file()]
-        for name, checksum in shards.items():
-            if name not in missing and _sha256(self.folder / name) != checksum:
+        there = {path.name for path in self._shards()}
+        for name in there & shards.keys():
+            if _sha256(self.folder / name) != shards[name]:
                 raise UsageError(
                     f"shard {self.folder / name} is damaged: its sha256 differs from the manifest's; "
                     "remove it, and what it held is gathered anew"
                 )
-        if missing:
-            log.warning("%s: %s missing; gathering anew what they held", self.folder, ", ".join(missing))
-        else:
+        if there == shards.keys():
             self.sequences, self.drives = sequences, drives
+        else:
+            log.warning("%s: not the shards of its manifest; what they lack is gathered anew", self.folder)
 
 
 def _sha256(path: Path) -> str:

@@ -48,6 +48,11 @@ class Trainer:
     def __init__(self, config: Config, table: FrameTable, held_out: NDArray[np.bool_], folder: Path) -> None:
         self.config, self.table, self.folder = config, table, folder
         self.train_rows, self.held_rows = np.flatnonzero(~held_out), np.flatnonzero(held_out)
+        if not (len(self.train_rows) and len(self.held_rows)):
+            raise UsageError(
+                f"{len(table)} sequences are too few to train on some drives and hold others out; "
+                "raise pretraining.sequences"
+            )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.model = Pretraining(config, make_encoder(config))
@@ -129,13 +134,16 @@ class Trainer:
     def held_out_losses(self) -> dict[str, float]:
         """Mean losses on held-out drives, in the precision of the training."""
         rows = self.held_rows[:: max(1, len(self.held_rows) // SAMPLE)]
+        parts = _parts(rows)
         with torch.inference_mode():
-            table = [[loss.item() for loss in self._losses(self._sampler(part))] for part in _parts(rows)]
-        return dict(zip(Losses._fields, np.mean(table, axis=0).tolist(), strict=True))
+            table = [[loss.item() for loss in self._losses(self._sampler(part))] for part in parts]
+        means = np.average(table, axis=0, weights=[len(part) for part in parts])
+        return dict(zip(Losses._fields, means.tolist(), strict=True))
 
     def figure(self, sequences: int, scale: int = 2) -> NDArray[np.uint8]:
         """Held-out sequences, evenly spaced over those that show the dolly, and their reconstructions."""
         rows = self.held_rows[self.table.visible[self.held_rows]]
+        rows = rows if len(rows) else self.held_rows
         chosen = rows[np.linspace(0, len(rows) - 1, sequences + 2).astype(int)[1:-1]]
         return reconstruction_figure(self.model, self.table, chosen, scale=scale)
 
@@ -145,10 +153,8 @@ class Trainer:
         model.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
         rows = self.train_rows[:: max(1, len(self.train_rows) // SAMPLE)]
         with torch.inference_mode():
-            squares = [
-                model.encoder(self._sampler(part).images).square().mean().item() for part in _parts(rows)
-            ]
-        rms = math.sqrt(float(np.mean(squares)))
+            codes = torch.cat([model.encoder(self._sampler(part).images) for part in _parts(rows)])
+        rms = math.sqrt(codes.square().mean().item())
         if rms > 0:
             model.encoder.scale_codes(CODE_RMS / rms)
             model.unit.fill_(rms / CODE_RMS)
