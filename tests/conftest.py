@@ -35,3 +35,14 @@ def client(endpoint: str, hub: zenoh.Session) -> Iterator[zenoh.Session]:
     """A client of `hub`."""
     with open_client(endpoint, patience=10.0) as session:
         yield session
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """For networks that are too small for more threads of torch, when the machine may be busy."""
+    import torch  # heavy, and few tests need it
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

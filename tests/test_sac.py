@@ -1,6 +1,6 @@
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -18,13 +18,7 @@ NORMALIZED = "network.normalize=true"
 PAPER = ("world.camera.size=16", "world.lidar.beams=2", "network.hidden=[16, 16]", "sac.target_interval=3")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    """These networks are too small for more, and the machine may be busy."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def make_batch(config: Config, size: int = 8, seed: int = 0, **fixed: float) -> Batch:
