@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import matplotlib.pyplot as plt
 import typer
 
-SNAPSHOT_STEPS = 10_000
+SNAPSHOT_STEPS = 15_000
 
 
 def navaclq(*arguments: object) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def train(weights: str, folder: Path, minutes: float, seed: int) -> Path:
 def examine(run: Path) -> dict[int, dict[str, Any]]:
     """Summaries on suite `train` by environment steps, one for each snapshot."""
     found = {}
-    for snapshot in sorted((run / "snapshots").iterdir()):
+    for snapshot in sorted((run / "snapshots").glob("[0-9f]*")):  # not the untrained one
         kept = run / "evaluation" / f"{snapshot.name}.json"
         if not kept.exists():
             kept.parent.mkdir(exist_ok=True)
