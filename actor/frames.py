@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from actor.service import count_life
 from actor.world.world import DockingWorld
 from common.bus import Keys, announce
 from common.cells import CELLS, arena_index
 from common.config import Config
-from common.delivery import Sender, Spool
+from common.delivery import Sender, Spool, count_life
 from common.frames import Film
 from common.geometry import bearing, wrap
 from common.messages import ContractReply, Frames
@@ -86,10 +85,10 @@ def film_all(
     tasks: list[Task], config: Config, progress: Callable[[int], None] = lambda done: None
 ) -> list[Film]:
     """A drive of up to PROBE_STEPS from each task, in order, on all cores; `progress` hears how many."""
-    chunks = [(tasks[i::FILM_CHUNKS], config) for i in range(FILM_CHUNKS)]
+    chunks = [tasks[i::FILM_CHUNKS] for i in range(FILM_CHUNKS)]
     films: list[Film | None] = [None] * len(tasks)
     done = 0
-    with multiprocessing.get_context("spawn").Pool(os.cpu_count(), _ignore_interrupts) as pool:
+    with multiprocessing.get_context("spawn").Pool(os.cpu_count(), _start_worker, (config,)) as pool:
         for index, found in enumerate(pool.imap(_film_chunk, chunks)):
             films[index::FILM_CHUNKS] = found
             done += len(found)
@@ -101,17 +100,18 @@ FILM_CHUNKS = len(CELLS)
 """Tasks go through the training cells in turn: so a chunk stays in one room."""
 
 
-def _ignore_interrupts() -> None:
+_world: DockingWorld | None = None
+
+
+def _start_worker(config: Config) -> None:
+    global _world
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    _world = DockingWorld(config.world, config.world.max_episode_steps)
 
 
-def _film_chunk(work: tuple[list[Task], Config]) -> list[Film]:
-    tasks, config = work
-    world = DockingWorld(config.world, config.world.max_episode_steps)
-    try:
-        return [film(world, task, np.random.default_rng([task.seed, 8]), PROBE_STEPS) for task in tasks]
-    finally:
-        world.close()
+def _film_chunk(tasks: list[Task]) -> list[Film]:
+    assert _world is not None
+    return [film(_world, task, np.random.default_rng([task.seed, 8]), PROBE_STEPS) for task in tasks]
 
 
 class FrameService:

@@ -17,7 +17,7 @@ from actor.rollout import Finished, Rollout
 from common.bus import Keys, announce, ask_later
 from common.config import Config
 from common.contract import contract_encoder
-from common.delivery import Sender, Spool
+from common.delivery import Sender, Spool, count_life
 from common.errors import UsageError
 from common.messages import (
     Candidate,
@@ -204,12 +204,3 @@ class ActorService:
                 **{f"task_{key}": value for key, value in self._categories.items()},
             }
         )
-
-
-def count_life(folder: Path) -> int:
-    """The how many-th incarnation of an actor this is, counted in its spool folder from 0."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / "lives"
-    lives = int(file.read_text()) if file.exists() and file.read_text().isdigit() else 0
-    file.write_text(str(lives + 1))
-    return lives

@@ -104,6 +104,15 @@ class Spool:
             self._bytes -= self._waiting.pop(path)
 
 
+def count_life(folder: Path) -> int:
+    """The how many-th incarnation of an actor this is, counted in its spool folder from 0."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "lives"
+    lives = int(file.read_text()) if file.exists() and file.read_text().isdigit() else 0
+    file.write_text(str(lives + 1))
+    return lives
+
+
 class Sender:
     """Sends what is in a spool, in order, from a thread of its own, until acknowledged.
 

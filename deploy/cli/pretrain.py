@@ -116,8 +116,8 @@ def _pretrain(
     own, out = config.pretraining, out or folder / "encoder"
     count = (os.cpu_count() or 1) if actors is None else actors
     check_out(out)
-    exit_on_signals()
     store = FrameStore(frames or folder / "frames", config)
+    exit_on_signals()
     if not store.complete:
         with options.progress(f"frames from hub {address}", own.sequences) as report:
             gather(store, folder, name, count, address, report, _say)
