@@ -27,7 +27,7 @@ test: setup
 test-slow: setup
 	$(BIN)/pytest -m slow --timeout 3600 $(ARGS)
 
-# Both shipped encoders from nothing: about 20 minutes and two hours on two cores.
+# Both shipped encoders from nothing; an interrupted one goes on where it was.
 encoders: setup
 	$(BIN)/navaclq pretrain --run runs/eyes-fast --frames runs/frames --seed 1 --out common/encoders/fast
 	$(BIN)/navaclq pretrain --run runs/eyes-paper --frames runs/frames --seed 1 --preset paper --epochs 10 \
