@@ -22,6 +22,7 @@ from common.world_config import StartRanges, WorldConfig
 
 Preset = Literal["paper", "fast", "smoke"]
 Variant = Literal["navacl-q", "rnd", "e2e"]
+Objective = Literal["reconstruction", "semantic"]
 
 
 class EncoderConfig(Section):
@@ -42,7 +43,7 @@ class EncoderConfig(Section):
 class PretrainingConfig(Section):
     """Pre-training of the encoder on frames of random drives (section 3.5)."""
 
-    objective: Literal["reconstruction", "semantic"] = "semantic"
+    objective: Objective = "semantic"
     """`reconstruction` is the paper's autoencoder; `semantic` adds what the simulator knows of the dolly."""
     sequences: Count = 50_000
     """Stacks of four frames to learn from; one ends at every frame (section 3.5)."""

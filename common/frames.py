@@ -28,6 +28,14 @@ class Film(NamedTuple):
     the robot's (rad)."""
 
 
+PART = 256
+
+
+def in_parts(rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows of a table, a few at a time, for what would not fit into memory at once."""
+    return [rows[first : first + PART] for first in range(0, len(rows), PART)]
+
+
 @dataclass(frozen=True, slots=True)
 class FrameTable:
     """Frames of many films, one after the other; each is stored once."""
@@ -65,6 +73,11 @@ class FrameTable:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """(N,) all rows."""
+        return np.arange(len(self))
 
     @property
     def visible(self) -> NDArray[np.bool_]:

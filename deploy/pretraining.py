@@ -71,7 +71,6 @@ def gather(
                     progress(store.sequences)
                     time.sleep(0.1)
             finally:
-                supervisor.stop()
                 receiver.close()
     finally:
         supervisor.stop()

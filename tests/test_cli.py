@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from common.config import parse, resolve
+from deploy.cli import options
 from deploy.cli.main import run
 from deploy.cli.options import parse_cells
 
@@ -157,3 +158,18 @@ def test_every_command_has_help(monkeypatch, capsys):
         code, out, _ = call(monkeypatch, capsys, *command.split(), "--help")
         assert code == 0
         assert "Usage" in out
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):
+    monkeypatch.setattr(options, "LINE_SECONDS", 0.0)
+    with options.progress("drives", 40) as report:
+        report(10)
+        report(10, "still")
+        report(30, "epoch 2")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["drives: 10 of 40", "drives: 10 of 40, still"]
+    assert lines[2] == "drives: 30 of 40, 0.0 min left, epoch 2"
+    monkeypatch.setattr(options, "LINE_SECONDS", 60.0)
+    with options.progress("drives", 40) as report:
+        report(10)
+    assert capsys.readouterr().err == ""

@@ -23,6 +23,7 @@ from common.delivery import pack_header
 from common.encoders import frozen_encoder, read_encoder
 from common.messages import Acknowledgement, Frames, Origin, decode, encode
 from common.tasks import Task
+from deploy.bench.encoder import SIZES
 from learner.checkpoint import RunDirectory
 from learner.pretraining.frame_store import FrameStore
 from learner.pretraining.receiver import FrameReceiver
@@ -204,6 +205,22 @@ def test_a_full_disk_ends_it_with_one_sentence_and_keeps_what_is_there(tmp_path)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_sizes_of_encoders_are_compared_on_the_same_frames(trained):
+    run, _ = trained
+    done = navaclq(
+        "bench", "encoder", "--preset", "smoke", "--frames", run / "frames", "--epochs", 1, "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    rows = {row["name"]: row for row in json.loads(done.stdout)["rows"]}
+    measures = ("code", "bearing_mae", "distance_mae", "yaw_mae", "visibility_accuracy", "per frame")
+    sizes = [" ".join(map(str, channels)) for channels in SIZES]
+    assert set(rows) == {f"{size}: {measure}" for size in sizes for measure in measures}
+    assert [rows[f"{size}: code"]["value"] for size in sizes] == [25 * channels[-1] for channels in SIZES]
+    assert rows[f"{sizes[0]}: per frame"]["value"] < rows[f"{sizes[-1]}: per frame"]["value"]
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_interrupted_training_leaves_an_encoder_and_goes_on(trained, tmp_path):
     run, _ = trained
@@ -251,6 +268,7 @@ def test_wrong_use_is_one_sentence(trained, tmp_path, monkeypatch, capsys):
         ((*smoke, "--run", tmp_path / "home"), "is not empty and no run directory"),
         ((*smoke, "--run", run, "--epochs", 3), "pretraining.epochs = 2, asked was 3"),
         (("pretrain", "--evaluate", tmp_path / "home"), "does not exist; choose"),
+        (("bench", "encoder", "--frames", tmp_path / "e"), "e is no folder; `navaclq pretrain` makes one"),
         (("learner", "--run", run), f"{run} is the folder of a pretraining"),
     ):
         code, out, err = call(monkeypatch, capsys, *arguments)
@@ -258,6 +276,7 @@ def test_wrong_use_is_one_sentence(trained, tmp_path, monkeypatch, capsys):
         assert words in err
     assert files(tmp_path / "home") == ["thesis.tex"]
     assert not (tmp_path / "d" / "frames").exists()
+    assert not (tmp_path / "e").exists()
 
 
 def test_only_whole_drives_of_this_run_from_training_cells_are_taken(tmp_path):

@@ -37,6 +37,8 @@ def encoder(
     from deploy.pretraining import film_probes
     from learner.pretraining.frame_store import FrameStore
 
+    if not frames.is_dir():
+        raise UsageError(f"--frames {frames} is no folder; `navaclq pretrain` makes one")
     store = FrameStore(frames, resolved)
     if not store.complete:
         raise UsageError(f"{frames} holds {store.sequences} sequences; `navaclq pretrain` gathers the rest")

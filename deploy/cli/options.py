@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 import time
@@ -163,9 +162,10 @@ def progress(label: str, total: int) -> Iterator[Report]:
             now = time.monotonic()
             if not console.is_terminal and now - said >= LINE_SECONDS:
                 said = now
-                left = (total - done) * (now - began) / 60 / (done - first) if done > first else math.inf
-                rest = f", {left:.1f} min left" if left < math.inf else ""
-                sys.stderr.write(f"{label}: {done} of {total}{rest}{'; ' if note else ''}{note}\n")
+                words = [f"{label}: {done} of {total}"]
+                if done > first:
+                    words.append(f"{(total - done) * (now - began) / (done - first) / 60:.1f} min left")
+                sys.stderr.write(", ".join([*words, *([note] if note else [])]) + "\n")
 
         yield report
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from common.bus import check_endpoint
-from common.config import Config
+from common.config import Config, Objective
 from common.encoders import RANDOM, encoder_folder
 from common.telemetry import exit_on_signals
 from deploy.cli import options
@@ -29,7 +29,6 @@ COLUMNS = {
     "reconstruction_mse": ("pixels MSE", 1.0),
     "mask_iou": ("mask IoU", 1.0),
 }
-Objective = Literal["reconstruction", "semantic"]
 
 
 def pretrain(

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.frames import FrameTable
+from common.frames import FrameTable, in_parts
 from common.networks import to_channels
 from learner.pretraining.objectives import Pretraining, pose_targets
 
@@ -23,7 +23,6 @@ RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Penalties tried, relative to the number of frames; features have unit variance."""
 CHECK = 5
 """One film in so many of the fitting set chooses among them."""
-BATCH = 256
 
 
 class Truth(NamedTuple):
@@ -43,9 +42,8 @@ class Truth(NamedTuple):
     @classmethod
     def of(cls, table: FrameTable) -> Truth:
         """The truth of every frame of a table."""
-        rows = np.arange(len(table))
         pictures, masks = [], []
-        for part in np.split(rows, range(BATCH, len(rows), BATCH)):
+        for part in in_parts(table.rows):
             picture = to_channels(torch.from_numpy(table.stacks(part, 1)))
             mask = torch.from_numpy(table.masks(part)).float()[:, None]
             pictures.append(F.adaptive_avg_pool2d(picture, COARSE).flatten(1))
@@ -103,10 +101,8 @@ def code_features(
     """The code of the newest frame, or of the newest stack, as a policy would see it."""
 
     def features(table: FrameTable) -> Tensor:
-        rows = np.arange(len(table))
-        parts = np.split(rows, range(BATCH, len(rows), BATCH))
-        codes = [torch.from_numpy(encode(table.stacks(part, frames_per_code))) for part in parts]
-        return torch.cat(codes).float()
+        stacks = (table.stacks(part, frames_per_code) for part in in_parts(table.rows))
+        return torch.cat([torch.from_numpy(encode(stack)) for stack in stacks]).float()
 
     return features
 
@@ -115,9 +111,7 @@ def pixel_features(side: int) -> Features:
     """The newest frame itself, averaged down to `side` pixels."""
 
     def features(table: FrameTable) -> Tensor:
-        rows = np.arange(len(table))
-        parts = np.split(rows, range(BATCH, len(rows), BATCH))
-        pictures = (to_channels(torch.from_numpy(table.stacks(part, 1))) for part in parts)
+        pictures = (to_channels(torch.from_numpy(table.stacks(part, 1))) for part in in_parts(table.rows))
         return torch.cat([F.adaptive_avg_pool2d(picture, side).flatten(1) for picture in pictures])
 
     return features
@@ -125,16 +119,15 @@ def pixel_features(side: int) -> Features:
 
 def decoder_quality(model: Pretraining, table: FrameTable) -> dict[str, float]:
     """What an encoder's own decoder makes of its codes: squared error of all pixels, and the mask's IoU."""
-    rows = np.arange(len(table))
     squares, both, either = 0.0, 0, 0
     with torch.inference_mode():
-        for part in np.split(rows, range(BATCH, len(rows), BATCH)):
+        for part in in_parts(table.rows):
             images = to_channels(torch.from_numpy(table.stacks(part, model.encoder.frames_per_code)))
             decoded, logits, _ = model(images)
             squares += float(F.mse_loss(decoded, images)) * len(part)
             found, true = logits > 0, torch.from_numpy(table.masks(part)) > 0
             both, either = both + int((found & true).sum()), either + int((found | true).sum())
-    quality = {"reconstruction_mse": squares / len(rows)}
+    quality = {"reconstruction_mse": squares / len(table)}
     return quality | {"mask_iou": both / max(either, 1)} if model.semantic else quality
 
 

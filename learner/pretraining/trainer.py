@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 from common.config import Config
 from common.encoders import ENCODER, HEADS
 from common.errors import UsageError
-from common.frames import FrameTable
+from common.frames import FrameTable, in_parts
 from common.networks import load_state, make_encoder, state_of
 from common.policy_files import CONFIG, load_tensors, save_folder
 from learner.optimizers import load_moments, moments_of
@@ -134,7 +134,7 @@ class Trainer:
     def held_out_losses(self) -> dict[str, float]:
         """Mean losses on held-out drives, in the precision of the training."""
         rows = self.held_rows[:: max(1, len(self.held_rows) // SAMPLE)]
-        parts = _parts(rows)
+        parts = in_parts(rows)
         with torch.inference_mode():
             table = [[loss.item() for loss in self._losses(self._sampler(part))] for part in parts]
         means = np.average(table, axis=0, weights=[len(part) for part in parts])
@@ -153,7 +153,7 @@ class Trainer:
         model.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
         rows = self.train_rows[:: max(1, len(self.train_rows) // SAMPLE)]
         with torch.inference_mode():
-            codes = torch.cat([model.encoder(self._sampler(part).images) for part in _parts(rows)])
+            codes = torch.cat([model.encoder(self._sampler(part).images) for part in in_parts(rows)])
         rms = math.sqrt(codes.square().mean().item())
         if rms > 0:
             model.encoder.scale_codes(CODE_RMS / rms)
@@ -190,7 +190,3 @@ class Trainer:
 def heads_state(model: Pretraining) -> dict[str, torch.Tensor]:
     """What belongs to a model but not to its encoder."""
     return {k: v for k, v in state_of(model=model).items() if not k.startswith("model.encoder.")}
-
-
-def _parts(rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    return [rows[i : i + 256] for i in range(0, len(rows), 256)]
