@@ -18,7 +18,7 @@ from common.policy_files import CONFIG, load_config, load_tensors
 
 ENCODER, HEADS = "encoder.safetensors", "heads.safetensors"
 SHIPPED_FOLDER = Path(__file__).parent / "encoders"
-SHIPPED = ("fast",)
+SHIPPED = ("fast", "paper")
 RANDOM = "random"
 AGREED = ("encoder.kind", "encoder.frames_per_code", "encoder.channels", "world.camera")
 """What a configuration must share with the encoder that it names."""
