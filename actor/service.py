@@ -90,8 +90,8 @@ class ActorService:
         while True:
             self._start_answered()
             self._refresh_weights()
-            if self._episodes.spool.full:
-                time.sleep(0.1)  # back-pressure: the learner is behind or away
+            if self._episodes.spool.full or self._episodes.held_back:
+                time.sleep(0.05)  # back-pressure: the learner is behind or away
             else:
                 for finished in self._rollout.step(self._actor):
                     self._ship(finished)

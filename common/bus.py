@@ -29,6 +29,9 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 BUSY = "BUSY"
+"""The one refusal that means: again, later."""
+GROUP = 64
+"""Queries that are answered together at most, where that spares work."""
 INTERNAL_ERROR = "internal error"
 LEASE_MS = 3000
 """A frozen or unreachable peer is given up after this."""
@@ -143,15 +146,23 @@ class QueryServer:
     """Answers the queries on one key expression from a thread of its own.
 
     `handler` gets (payload, attachment) and returns the reply; a MessageError it raises is sent back as the
-    refusal. With `capacity` queries waiting the next one is told BUSY at once. Refusals are counted in
-    `refused` by reason and logged at most once a second.
+    refusal. With `capacity` queries waiting the next one is told BUSY at once. Refusals but that one are
+    counted in `refused` by reason and logged at most once a second.
+
+    With `commit`, queries that wait together are handled one after the other, then `commit` is called once,
+    and only then are they answered: a disk that is slow to confirm confirms many at a time.
     """
 
     def __init__(
-        self, session: zenoh.Session, key: str, handler: Callable[[bytes, bytes], bytes], capacity: int = 256
+        self,
+        session: zenoh.Session,
+        key: str,
+        handler: Callable[[bytes, bytes], bytes],
+        capacity: int = 256,
+        commit: Callable[[], None] | None = None,
     ) -> None:
         self.refused: Counter[str] = Counter()
-        self._key, self._handler = key, handler
+        self._key, self._handler, self._commit = key, handler, commit
         self._inbox: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
         self._logged = 0.0
         self._thread = threading.Thread(target=self._serve, name=f"serve {key}", daemon=True)
@@ -166,32 +177,53 @@ class QueryServer:
 
     def _serve(self) -> None:
         while (query := self._inbox.get()) is not None:
+            queries = [query]
+            while self._commit and len(queries) < GROUP and not self._inbox.empty():
+                query = self._inbox.get()
+                if query is None:
+                    self._inbox.put(None)
+                    break
+                queries.append(query)
+            self._answer(queries)
+            del query, queries  # an undropped query would hold its reply back until the timeout
+
+    def _answer(self, queries: list[zenoh.Query]) -> None:
+        answers = [self._handle(query) for query in queries]
+        try:
+            if self._commit:
+                self._commit()
+        except Exception:
+            log.exception("could not commit what came on %s", self._key)
+            answers = [INTERNAL_ERROR] * len(queries)
+        for query, answer in zip(queries, answers, strict=True):
             try:
-                self._answer(query)
+                if isinstance(answer, str):
+                    self._refuse(query, answer)
+                else:
+                    with query:
+                        query.reply(self._key, answer)  # the query's own expression may hold wildcards
             except Exception:  # this thread must outlive whatever one query brings, a lost session included
                 log.exception("could not answer %s", self._key)
-            query = None  # an undropped query would hold its reply back until the timeout
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _handle(self, query: zenoh.Query) -> zenoh.ZBytes | str:
+        """The answer, or the reason of a refusal."""
         try:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             attachment = query.attachment.to_bytes() if query.attachment is not None else b""
-            answer = zenoh.ZBytes(self._handler(payload, attachment))
+            return zenoh.ZBytes(self._handler(payload, attachment))
         except MessageError as error:
-            self._refuse(query, str(error))
+            return str(error)
         except Exception:
             log.exception("error while answering %s", query.key_expr)
-            self._refuse(query, INTERNAL_ERROR)
-        else:
-            with query:
-                query.reply(self._key, answer)  # the query's own expression may hold wildcards
+            return INTERNAL_ERROR
 
     def _refuse(self, query: zenoh.Query, reason: str) -> None:
-        self.refused[reason.split(":")[0][:40] if len(self.refused) < 100 else "other"] += 1
-        now = time.monotonic()
-        if now - self._logged >= 1.0:
-            self._logged = now
-            log.warning("refused a message on %s: %s", query.key_expr, reason)
+        if reason != BUSY:
+            self.refused[reason.split(":")[0][:40] if len(self.refused) < 100 else "other"] += 1
+            now = time.monotonic()
+            if now - self._logged >= 1.0:
+                self._logged = now
+                log.warning("refused a message on %s: %s", query.key_expr, reason)
         with query:
             query.reply_err(reason.encode())
 

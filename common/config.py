@@ -89,6 +89,10 @@ class SacConfig(Section):
     learning_rate: Positive = 3e-4
     batch_size: Count = 128
     n_step: Count = 3
+    critic_loss: Literal["squared", "huber"] = "squared"
+    """`huber` is linear beyond an error of 1."""
+    actor_batch: Literal["critic", "uniform"] = "critic"
+    """What policy and temperature learn from: the critics' prioritised batch, or a uniform one."""
     target: Literal["soft", "hard"] = "soft"
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
     """Smoothing of soft targets."""
@@ -117,6 +121,12 @@ class ReplayConfig(Section):
     """Environment steps over which b goes from b_0 to b_1."""
     warmup_steps: Count = 2_000
     """Transitions stored before the first update."""
+    samples_per_insert: Positive = 64.0
+    """Transitions sampled per transition stored after the warm-up: with batches of 128, an update per two."""
+    error_buffer: Positive = 10_000.0
+    """Samples by which learning may run ahead of that, or lag behind."""
+    hold_actors: bool = False
+    """Whether actors wait for a learner that lags behind; if not, the lag beyond the band is forgotten."""
 
     @model_validator(mode="after")
     def _can_begin(self) -> ReplayConfig:
@@ -128,15 +138,17 @@ class ReplayConfig(Section):
 class LearnerConfig(Section):
     """The learner process."""
 
-    updates_per_step: Positive = 0.5
-    """Most SAC updates per environment step beyond the warm-up."""
+    durability: Literal["process", "host"] = "process"
+    """What an acknowledged episode survives: the death of the learner, or (fdatasync) that of its host."""
     publish_seconds: Positive = 2.0
     checkpoint_seconds: Positive = 60.0
     snapshot_steps: Count = 25_000
     """Environment steps between kept snapshots of the policy."""
     keep_checkpoints: Count = 3
-    threads: Count = 1
-    """Threads of torch."""
+    threads: Count | Literal["auto"] = "auto"
+    """Threads of torch; `auto`: half of the cores, at most four, so that actors beside it are not starved."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where SAC computes; `auto`: on a GPU if there is one. On a GPU it was never run."""
 
 
 class ActorConfig(Section):
@@ -277,10 +289,11 @@ def override(values: dict[str, Any], overrides: tuple[str, ...]) -> Config:
     return validate(values)
 
 
-def parse(text: str) -> Config:
-    """A configuration written by `Config.to_toml`."""
+def parse(text: str, sections: tuple[str, ...] = ()) -> Config:
+    """A configuration written by `Config.to_toml`, or only these sections of it."""
     try:
-        return validate(tomllib.loads(text))
+        values = tomllib.loads(text)
+        return validate({key: values[key] for key in sections if key in values} if sections else values)
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"the configuration is not TOML: {error}") from None
 

@@ -118,7 +118,7 @@ class Sender:
 
     No reply, BUSY and an error within the receiver mean: again, later, with the same id. Any other refusal is
     final: the message is dropped, counted in `refused` by reason and logged, and `last_refusal` holds the
-    reason.
+    reason. `held_back` while the receiver says BUSY: whoever produces messages had better pause.
     """
 
     def __init__(
@@ -128,6 +128,7 @@ class Sender:
         self.refused: Counter[str] = Counter()
         self.last_refusal = ""
         self.waiting_since: float | None = None
+        self.held_back = False
         self._session, self._actor, self._boot, self._timeout = session, actor, boot, timeout
         self._seq, self._lock = 0, threading.Lock()
         self._stop = threading.Event()
@@ -163,6 +164,7 @@ class Sender:
                 ask_bytes(self._session, key, payload, header, self._timeout)
                 self.sent += 1
             except (NoAnswerError, RefusedError, zenoh.ZError) as error:
+                self.held_back = str(error) == BUSY
                 if not isinstance(error, RefusedError) or str(error) in (BUSY, INTERNAL_ERROR):
                     self.waiting_since = self.waiting_since or time.monotonic()
                     self._stop.wait(pause * jitter.uniform(0.5, 1.5))
@@ -172,7 +174,7 @@ class Sender:
                 self.refused[str(error).split(":")[0][:60]] += 1
                 log.warning("refused for good on %s: %s", key, error)
             self.spool.remove(path)
-            self.waiting_since, pause = None, 0.1
+            self.waiting_since, self.held_back, pause = None, False, 0.1
 
     def close(self, patience: float) -> int:
         """Tries for `patience` s to empty the spool, then stops; returns how many stay on disk."""

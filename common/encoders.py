@@ -22,6 +22,8 @@ SHIPPED = ("fast", "paper")
 RANDOM = "random"
 AGREED = ("encoder.kind", "encoder.frames_per_code", "encoder.channels", "world.camera")
 """What a configuration must share with the encoder that it names."""
+MADE_BY = ("seed", "preset", "world", "encoder", "pretraining")
+"""The sections of a configuration that an encoder was made by."""
 
 
 def encoder_folder(name: str) -> Path:
@@ -37,7 +39,7 @@ def encoder_folder(name: str) -> Path:
 
 def read_encoder(folder: Path) -> tuple[Config, Encoder]:
     """An encoder with the configuration it was made with; raises UsageError when the files do not fit."""
-    config = load_config(folder)
+    config = load_config(folder, MADE_BY)
     encoder = make_encoder(config)
     try:
         load_state(load_tensors(folder / ENCODER), encoder=encoder)

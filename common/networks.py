@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from io import BytesIO
 from itertools import pairwise
@@ -150,35 +151,86 @@ def compile_encoder(
     return encode
 
 
-def _mlp(sizes: tuple[int, ...], layer_norm: bool = False) -> nn.Sequential:
+class ParallelLinear(nn.Module):
+    """Linear layers of `members` networks side by side, of one input or of the concatenation of several.
+
+    Weights lie (members, inputs, outputs) and apart for every input: products, and gradients, of all members
+    are then one call, nothing is concatenated or transposed, and an input without a gradient costs none.
+    """
+
+    def __init__(self, members: int, inputs: tuple[int, ...], outputs: int) -> None:
+        super().__init__()
+        bound = sum(inputs) ** -0.5  # torch.nn.Linear's
+        shapes = [(members, size, outputs) for size in inputs]
+        self.weights = nn.ParameterList(torch.empty(shape).uniform_(-bound, bound) for shape in shapes)
+        self.bias = nn.Parameter(torch.empty(members, 1, outputs).uniform_(-bound, bound))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """(B, inputs) for all members or (members, B, inputs) each -> (members, B, outputs)."""
+        factors = [(x.expand(len(w), -1, -1), w) for x, w in zip(inputs, self.weights, strict=True)]
+        out = torch.baddbmm(self.bias, *factors[0])
+        for pair in factors[1:]:
+            out.baddbmm_(*pair)
+        return out
+
+
+class ParallelNorm(nn.Module):
+    """LayerNorm over the features of each member."""
+
+    def __init__(self, members: int, features: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(members, 1, features))
+        self.bias = nn.Parameter(torch.zeros(members, 1, features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(members, B, features), the same shape."""
+        return torch.addcmul(self.bias, F.layer_norm(x, x.shape[-1:]), self.weight)
+
+
+def _activation(members: int, features: int, layer_norm: bool) -> list[nn.Module]:
+    return [*([ParallelNorm(members, features)] if layer_norm else []), nn.ReLU(inplace=True)]
+
+
+def _mlp(members: int, sizes: tuple[int, ...], layer_norm: bool = False) -> nn.Sequential:
     layers: list[nn.Module] = []
     for a, b in pairwise(sizes):
-        layers += [nn.Linear(a, b), *([nn.LayerNorm(b)] if layer_norm else []), nn.ReLU()]
+        layers += [ParallelLinear(members, (a,), b), *_activation(members, b, layer_norm)]
     return nn.Sequential(*layers)
 
 
 class FusionNetwork(nn.Module):
-    """Branches for LiDAR and history, concatenated with the visual code (and an action), then the head."""
+    """Networks side by side: branches for LiDAR and history, fused with the code (and actions), a head."""
 
     def __init__(
-        self, layout: ObservationLayout, config: NetworkConfig, extra: int, outputs: int, layer_norm: bool
+        self,
+        layout: ObservationLayout,
+        config: NetworkConfig,
+        members: int,
+        extra: tuple[int, ...],
+        outputs: int,
+        layer_norm: bool,
     ) -> None:
         super().__init__()
         self._sizes = [layout.visual, layout.lidar, layout.history]
         self._branched = bool(config.lidar_branch or config.history_branch)
-        self.lidar_branch = _mlp((layout.lidar, *config.lidar_branch))
-        self.history_branch = _mlp((layout.history, *config.history_branch))
-        fused = layout.visual + (layout.lidar, *config.lidar_branch)[-1]
-        fused += (layout.history, *config.history_branch)[-1] + extra
-        self.head = _mlp((fused, *config.hidden), layer_norm)
-        self.output = nn.Linear(config.hidden[-1], outputs)
+        lidar, history = (layout.lidar, *config.lidar_branch), (layout.history, *config.history_branch)
+        self.lidar_branch = _mlp(members, lidar)
+        self.history_branch = _mlp(members, history)
+        fused = (layout.visual, lidar[-1], history[-1]) if self._branched else (layout.size,)
+        first = config.hidden[0]
+        self.fusion = ParallelLinear(members, (*fused, *extra), first)
+        self.head = nn.Sequential(
+            *_activation(members, first, layer_norm), *_mlp(members, config.hidden, layer_norm)
+        )
+        self.output = ParallelLinear(members, (config.hidden[-1],), outputs)
 
     def forward(self, flat: Tensor, *extra: Tensor) -> Tensor:
-        """(B, layout.size), and (B, extra) if any -> (B, outputs)."""
+        """(B, layout.size), and (B, extra) if any -> (members, B, outputs)."""
+        parts = [flat]
         if self._branched:
             visual, lidar, history = torch.split(flat, self._sizes, dim=-1)
-            flat = torch.cat([visual, self.lidar_branch(lidar), self.history_branch(history)], dim=-1)
-        out: Tensor = self.output(self.head(torch.cat([flat, *extra], dim=-1) if extra else flat))
+            parts = [visual, self.lidar_branch(lidar), self.history_branch(history)]
+        out: Tensor = self.output(self.head(self.fusion(*parts, *extra)))
         return out
 
 
@@ -187,11 +239,11 @@ class Policy(nn.Module):
 
     def __init__(self, layout: ObservationLayout, config: NetworkConfig) -> None:
         super().__init__()
-        self.net = FusionNetwork(layout, config, 0, 2 * ACTION_SIZE, layer_norm=False)
+        self.net = FusionNetwork(layout, config, 1, (), 2 * ACTION_SIZE, layer_norm=False)
 
     def forward(self, flat: Tensor) -> tuple[Tensor, Tensor]:
         """(B, layout.size) -> mean and log standard deviation before the tanh, (B, 2) each."""
-        mean, log_std = self.net(flat).chunk(2, dim=-1)
+        mean, log_std = self.net(flat)[0].chunk(2, dim=-1)
         half = (LOG_STD_MAX - LOG_STD_MIN) / 2
         return mean, LOG_STD_MIN + half * (torch.tanh(log_std) + 1)
 
@@ -203,9 +255,9 @@ class Policy(nn.Module):
         """Reparameterised action (B, 2) for standard normal `noise` (B, 2), and its log density (B,)."""
         mean, log_std = self(flat)
         raw = mean + log_std.exp() * noise
-        log_density = (-0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
+        log_density = (-0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
         # log(1 - tanh(raw)^2), written so that it does not underflow
-        log_jacobian = (2 * (np.log(2) - raw - F.softplus(-2 * raw))).sum(-1)
+        log_jacobian = (2 * (math.log(2) - raw - F.softplus(-2 * raw))).sum(-1)
         return torch.tanh(raw), log_density - log_jacobian
 
 
@@ -214,13 +266,12 @@ class TwinCritic(nn.Module):
 
     def __init__(self, layout: ObservationLayout, config: NetworkConfig) -> None:
         super().__init__()
-        self.critics = nn.ModuleList(
-            FusionNetwork(layout, config, ACTION_SIZE, 1, config.layer_norm) for _ in range(2)
-        )
+        self.net = FusionNetwork(layout, config, 2, (ACTION_SIZE,), 1, config.layer_norm)
 
     def forward(self, flat: Tensor, action: Tensor) -> Tensor:
         """(B, layout.size), (B, 2) -> (2, B)."""
-        return torch.stack([critic(flat, action).squeeze(-1) for critic in self.critics])
+        twins: Tensor = self.net(flat, action).squeeze(-1)
+        return twins
 
 
 class Normalizer(nn.Module):
@@ -256,19 +307,23 @@ class Perception(nn.Module):
     running normalisation, which leaves learned codes alone.
     """
 
+    _like: Tensor
+    """Empty; of the type, and on the device, that observations are brought to."""
+
     def __init__(self, config: Config) -> None:
         super().__init__()
         layout = ObservationLayout.of(config)
+        self.register_buffer("_like", torch.empty(0), persistent=False)
         self.encoder = make_encoder(config) if config.encoder.end_to_end else None
         stored = layout.size if self.encoder is None else layout.size - layout.visual
         self.normalizer = Normalizer(stored) if config.network.normalize else None
 
     def _stored(self, observation: Observation) -> Tensor:
         """The parts that are stored as they are, so that their scale can be known: all but learned codes."""
-        parts = [torch.from_numpy(observation.lidar).float(), torch.from_numpy(observation.history)]
+        parts = [observation.lidar, observation.history]
         if self.encoder is None:
-            parts.insert(0, torch.from_numpy(observation.visual).flatten(1).float())
-        return torch.cat(parts, dim=1)
+            parts.insert(0, observation.visual)
+        return torch.cat([torch.from_numpy(part).flatten(1).to(self._like) for part in parts], dim=1)
 
     def forward(self, observation: Observation) -> Tensor:
         """B observations -> (B, layout.size) float32."""
@@ -277,7 +332,8 @@ class Perception(nn.Module):
             stored = self.normalizer(stored)
         if self.encoder is None:
             return stored
-        return torch.cat([self.encoder.encode_stacks(torch.from_numpy(observation.visual)), stored], dim=1)
+        frames = torch.from_numpy(observation.visual).to(self._like.device)
+        return torch.cat([self.encoder.encode_stacks(frames), stored], dim=1)
 
     def watch(self, observation: Observation) -> None:
         """Lets the running normalisation see a batch."""

@@ -5,6 +5,8 @@ What the learner writes as checkpoint or snapshot and what evaluation reads.
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,21 +24,49 @@ CONFIG, NETWORKS = "config.toml", "networks.safetensors"
 def save_folder(
     folder: Path, files: Mapping[str, str | bytes], tensors: dict[str, dict[str, Tensor]]
 ) -> None:
-    """Writes files, of text or bytes, and files of tensors into a new folder by way of a temporary name."""
-    part = folder.with_name(folder.name + ".part")
-    if part.exists():
-        shutil.rmtree(part)
+    """Writes files, of text or bytes, and files of tensors into a new folder by way of a temporary name.
+
+    Raises OSError when it cannot.
+    """
+    part, old = _unfinished(folder)
+    _finish(folder)
     part.mkdir(parents=True)
     for name, content in files.items():
         (part / name).write_bytes(content.encode() if isinstance(content, str) else content)
     for name, group in tensors.items():
         # safetensors refuses tensors that share memory, as those of a target network may
-        save_file({key: value.detach().clone().contiguous() for key, value in group.items()}, part / name)
-    old = folder.with_name(folder.name + ".old.part")
+        own = {key: value.detach().clone().contiguous() for key, value in group.items()}
+        try:
+            save_file(own, part / name)
+        except SafetensorError as error:
+            number = re.search(r"os error (\d+)", str(error))
+            if number is None:
+                raise
+            raise OSError(int(number[1]), os.strerror(int(number[1])), str(part / name)) from None
     if folder.exists():
         folder.rename(old)
     part.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def finish_saving(parent: Path) -> None:
+    """Brings the folders in `parent` in order after a `save_folder` that was killed."""
+    for left in [path for path in parent.glob("*.part") if path.is_dir()]:
+        _finish(parent / left.name.removesuffix(".part").removesuffix(".old"))
+
+
+def _unfinished(folder: Path) -> tuple[Path, Path]:
+    """The names of what is being written, and of what it is about to replace."""
+    return folder.with_name(folder.name + ".part"), folder.with_name(folder.name + ".old.part")
+
+
+def _finish(folder: Path) -> None:
+    part, old = _unfinished(folder)
+    if old.exists() and not folder.exists():
+        old.rename(folder)
+    for left in (part, old):
+        if left.exists():
+            shutil.rmtree(left)
 
 
 def load_tensors(file: Path) -> dict[str, Tensor]:
@@ -49,10 +79,14 @@ def load_tensors(file: Path) -> dict[str, Tensor]:
         raise UsageError(f"{file} is damaged: {error}") from None
 
 
-def load_config(folder: Path) -> Config:
-    """The configuration in a folder; raises UsageError when it is damaged or of another version."""
+def load_config(folder: Path, sections: tuple[str, ...] = ()) -> Config:
+    """The configuration in a folder; raises UsageError when it is damaged or of another version.
+
+    With `sections` only those count, and all others have their defaults: what was made for one purpose
+    outlives changes elsewhere.
+    """
     try:
-        return parse((folder / CONFIG).read_text("utf-8"))
+        return parse((folder / CONFIG).read_text("utf-8"), sections)
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{folder / CONFIG} is damaged: {error}") from None
     except UsageError as error:

@@ -8,6 +8,11 @@ from pathlib import Path
 from common.errors import UsageError
 
 
+def learner_threads(wanted: int | str, cores: int) -> int:
+    """Threads of torch for a learner that shares its cores with actors."""
+    return wanted if isinstance(wanted, int) else max(1, min(4, cores // 2))
+
+
 def check_memory(what: str, need: float, cure: str) -> None:
     """Raises UsageError when `what` needs more bytes than are free, where the system tells."""
     try:

@@ -13,7 +13,7 @@ from common.config import Config
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
 from common.messages import Candidates, Outcome, Proposal, Requested
-from common.policy_files import load_tensors, save_folder
+from common.policy_files import finish_saving, load_tensors, save_folder
 from common.tasks import Task, candidate_task, random_task
 from common.world_config import StartRanges
 from curriculum.adaptive_filtering import fit_normal, get_anchored_task, get_dynamic_task, get_task_type
@@ -156,6 +156,7 @@ class Curriculum:
 
     def restore(self, folder: Path) -> None:
         """Takes what `save` wrote, if it is there; raises UsageError when it does not fit."""
+        finish_saving(folder.parent)
         if not (folder / "state.json").exists():
             return
         try:

@@ -93,11 +93,12 @@ class Screen:
         return (
             f"{_clock(v.get('elapsed_s', 0))}  steps {v['env_steps']} ({v['steps_per_s']}/s)  "
             f"updates {v['updates']} ({v['updates_per_s']}/s)  episodes {v['episodes']}  "
-            f"success/100 {_share(v, 'charts/success_100')}  success/500 {_share(v, 'charts/success_500')}  "
+            f"success/100 {_share(v, 'charts/success_100')}  "
+            f"random tasks {_share(v, 'charts/success_random')}  "
             f"endings {_mix(v, 'endings/')}  tasks {_mix(v, 'tasks/')}  replay {v['replay']}  "
             f"staleness {_number(v, 'charts/staleness')}  alpha {_number(v, 'losses/alpha')}  "
-            f"q {_number(v, 'losses/qf_values')}  refused {v['refused']}  gate {_gate(gate)}  "
-            f"processes {alive}"
+            f"q {_number(v, 'losses/qf_values')}  refused {v['refused']}  "
+            f"failed writes {v['failed_writes']}  gate {_gate(gate)}  processes {alive}"
         )
 
     def _picture(self, processes: list[tuple[str, bool, int]]) -> Panel:
@@ -109,7 +110,8 @@ class Screen:
             ("updates", f"{v.get('updates', 0)}  ({v.get('updates_per_s', 0)}/s)"),
             ("episodes", str(v.get("episodes", 0))),
             ("success, last 100", _share(v, "charts/success_100")),
-            ("success, last 500", _share(v, "charts/success_500")),
+            ("success on random tasks", _share(v, "charts/success_random")),
+            ("success on random tasks", _share(v, "charts/success_random")),
             ("endings", _mix(v, "endings/")),
             ("tasks", _mix(v, "tasks/")),
             ("replay", f"{v.get('replay', 0)} transitions"),
@@ -117,6 +119,7 @@ class Screen:
             ("temperature", _number(v, "losses/alpha")),
             ("Q", _number(v, "losses/qf_values")),
             ("refused messages", str(v.get("refused", 0))),
+            ("failed writes", str(v.get("failed_writes", 0))),
             ("gate", _gate(self._monitor.curriculum)),
         ]
         for name, value in rows:

@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from common.config import Config, differing_keys, parse
 from common.encoders import ENCODER, frozen_encoder, pack_encoder
 from common.errors import UsageError
 from common.files import write_atomically
-from common.policy_files import CONFIG, NETWORKS, load_tensors, save_folder
+from common.messages import Version
+from common.networks import Encoder, state_of
+from common.policy_files import CONFIG, NETWORKS, finish_saving, load_tensors, save_folder
+from learner.learner import Learner
 from learner.sac import SAC
 
-RUN_SCHEMA = 2
+RUN_SCHEMA = 3
 """Version of the run directory's layout."""
+OPTIMIZERS, PRIORITIES, STATE = "optimizers.safetensors", "priorities.safetensors", "state.json"
+BEFORE_IDENTITY = {"logs", "spool", CONFIG, ENCODER, "checkpoints", "run.json.part"}
+"""What may be there without run.json: the launcher's, and that of a start which was interrupted."""
+FIRST = Version()
+"""Of the checkpoint with which a run begins that takes its weights from another."""
 
 
 class RunDirectory:
@@ -28,28 +40,55 @@ class RunDirectory:
     """
 
     def __init__(
-        self, folder: Path, config: Config | None = None, job: Literal["training", "pretraining"] = "training"
+        self,
+        folder: Path,
+        config: Config | None = None,
+        job: Literal["training", "pretraining"] = "training",
+        source: Path | None = None,
     ) -> None:
-        """Opens a run, or with `config` starts one; raises UsageError when the folder is something else."""
+        """Opens a run, or with `config` starts one, with the weights of the checkpoint `source` if given.
+
+        Raises UsageError when the folder is something else, when there is nothing to start, or when the
+        weights do not fit.
+        """
         self.folder, self.name = folder, folder.resolve().name
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", self.name):
             raise UsageError(f"run name {self.name!r} may hold letters, digits, _, . and - only, at most 64")
         identity = folder / "run.json"
         self._job = job
         if identity.exists():
+            if source is not None:
+                raise UsageError(f"{folder} exists; to begin from {source} choose another --run")
             self.config = self._open(identity, config)
+            with self._writing():
+                for name in ("checkpoints", "snapshots"):
+                    finish_saving(folder / name)
         elif config is None:
             raise UsageError(f"{folder} is no run directory: it has no run.json")
-        elif folder.exists() and any(p.name not in ("logs", "spool") for p in folder.iterdir()):
+        elif folder.exists() and not {path.name for path in folder.iterdir()} <= BEFORE_IDENTITY:
             raise UsageError(f"{folder} is not empty and no run directory; choose another --run")
         else:
             self.config = config
-            encoder = pack_encoder(frozen_encoder(config)) if job == "training" else None
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / CONFIG).write_text(config.to_toml(), "utf-8")
-            if encoder is not None:
-                (folder / ENCODER).write_bytes(encoder)
-            write_atomically(identity, json.dumps({"schema": RUN_SCHEMA, "job": job, "epoch": 0}).encode())
+            encoder = frozen_encoder(config) if job == "training" else None
+            weights = _weights_for(config, encoder, source) if encoder and source else None
+            with self._writing():
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / CONFIG).write_text(config.to_toml(), "utf-8")
+                if encoder is not None:
+                    (folder / ENCODER).write_bytes(pack_encoder(encoder))
+                shutil.rmtree(folder / "checkpoints", ignore_errors=True)  # of a start that was interrupted
+                if weights is not None:
+                    self._write(self._checkpoint(FIRST), {NETWORKS: weights}, {"from": str(source)})
+                identity_values = {"schema": RUN_SCHEMA, "job": job, "epoch": 0}
+                write_atomically(identity, json.dumps(identity_values).encode())
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turns an error of the disk, at the start, into wrong use."""
+        try:
+            yield
+        except OSError as error:
+            raise UsageError(f"cannot write to the run directory {self.folder}: {error.strerror}") from None
 
     @property
     def encoder(self) -> bytes:
@@ -82,25 +121,42 @@ class RunDirectory:
             )
         return config
 
+    @property
+    def best_score(self) -> float:
+        """Success of the best policy kept so far; -inf when there is none."""
+        try:
+            state = json.loads((self.folder / "snapshots" / "best" / STATE).read_text("utf-8"))
+            score = float(state["success_random"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return -math.inf
+        return score if math.isfinite(score) else -math.inf
+
     def next_epoch(self) -> int:
         """Counts one more start of the learner and remembers it; never runs backwards."""
         identity = self.folder / "run.json"
         values = json.loads(identity.read_text("utf-8"))
         values["epoch"] += 1
-        write_atomically(identity, json.dumps(values).encode())
+        with self._writing():
+            write_atomically(identity, json.dumps(values).encode())
         return int(values["epoch"])
 
-    def save(self, sac: SAC, frozen: dict[str, Tensor], env_steps: int) -> None:
-        """A checkpoint of all that learns and of what is frozen; keeps the newest few."""
-        networks, moments = sac.state()
-        networks |= frozen
-        state = {"updates": sac.updates, "env_steps": env_steps}
-        folder = self.folder / "checkpoints" / f"{sac.updates:09d}"
-        self._write(folder, {NETWORKS: networks, "optimizers.safetensors": moments}, state)
+    def save(self, learner: Learner, frozen: dict[str, Tensor], epoch: int, env_steps: int) -> None:
+        """A checkpoint of all that learns and of what is frozen; keeps the newest few.
+
+        Raises OSError when it cannot be written; those that were there stay whole.
+        """
+        tensors, state = learner.save()
+        files = {
+            NETWORKS: tensors["networks"] | frozen,
+            OPTIMIZERS: tensors["optimizers"],
+            PRIORITIES: tensors["priorities"],
+        }
+        folder = self._checkpoint(Version(epoch=epoch, counter=learner.sac.updates))
+        self._write(folder, files, state | {"env_steps": env_steps})
         for old in self.checkpoints()[: -self.config.learner.keep_checkpoints]:
             shutil.rmtree(old)
 
-    def snapshot(self, name: str, networks: dict[str, Tensor], state: dict[str, int]) -> Path:
+    def snapshot(self, name: str, networks: dict[str, Tensor], state: dict[str, Any]) -> Path:
         """Keeps a policy for evaluation."""
         folder = self.folder / "snapshots" / name
         self._write(folder, {NETWORKS: networks}, state)
@@ -108,25 +164,61 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Whole checkpoints, oldest first."""
-        return sorted(p for p in (self.folder / "checkpoints").glob("*") if p.suffix != ".part")
+        return _whole(self.folder / "checkpoints")
 
-    def restore(self, sac: SAC) -> int:
-        """Loads the newest checkpoint, if there is one; returns its update count, else 0."""
-        checkpoints = self.checkpoints()
-        if not checkpoints:
-            return 0
-        newest = checkpoints[-1]
-        try:
-            updates = int(json.loads((newest / "state.json").read_text("utf-8"))["updates"])
-            sac.load(
-                load_tensors(newest / NETWORKS), load_tensors(newest / "optimizers.safetensors"), updates
-            )
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+    def restore(self, learner: Learner) -> None:
+        """Loads the newest checkpoint, if there is one, once the replay holds its episodes again."""
+        for newest in self.checkpoints()[-1:]:
+            try:
+                state = json.loads((newest / STATE).read_text("utf-8"))
+                networks = load_tensors(newest / NETWORKS)
+                if "from" in state:
+                    learner.sac.load_weights(networks)
+                else:
+                    moments, priorities = (load_tensors(newest / name) for name in (OPTIMIZERS, PRIORITIES))
+                    tensors = {"networks": networks, "optimizers": moments, "priorities": priorities}
+                    learner.load(tensors, state)
+            except (OSError, ValueError, KeyError, TypeError, RuntimeError, UsageError) as error:
+                raise UsageError(
+                    f"checkpoint {newest} does not fit: {error}; remove it to use an older one"
+                ) from None
+
+    def _checkpoint(self, version: Version) -> Path:
+        return self.folder / "checkpoints" / f"{version.epoch:05d}-{version.counter:09d}"
+
+    def _write(self, folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, Any]) -> None:
+        save_folder(folder, {CONFIG: self.config.to_toml(), STATE: json.dumps(state)}, tensors)
+
+
+def _whole(parent: Path) -> list[Path]:
+    """Checkpoints that are whole, oldest first."""
+    return sorted(path for path in parent.glob("*") if path.suffix != ".part")
+
+
+def _weights_for(config: Config, encoder: Encoder, source: Path) -> dict[str, Tensor]:
+    """The networks of a checkpoint, or of a run's newest one.
+
+    Raises UsageError when there are none, when they are of another shape than `config` asks for, and when
+    another encoder made the codes that they read.
+    """
+    if (source / "run.json").exists():
+        if not _whole(source / "checkpoints"):
+            raise UsageError(f"{source} has no checkpoint yet")
+        source = _whole(source / "checkpoints")[-1]
+    networks, sac = load_tensors(source / NETWORKS), SAC(config)
+    try:
+        sac.load_weights(networks)
+        own = state_of(perception=sac.perception)
+        for name in networks:  # load_weights passes over what it has no use for
+            if name.startswith("perception.") and name not in own:
+                raise ValueError(f"tensor {name} has no place in it")
+    except ValueError as error:
+        raise UsageError(f"{source} does not fit the configuration: {error}") from None
+    frozen = {} if config.encoder.end_to_end else state_of(encoder=encoder)
+    for name, tensor in frozen.items():
+        if name not in networks or not torch.equal(networks[name], tensor):
             raise UsageError(
-                f"checkpoint {newest} does not fit: {error}; remove it to use an older one"
-            ) from None
-        return updates
-
-    def _write(self, folder: Path, tensors: dict[str, dict[str, Tensor]], state: dict[str, int]) -> None:
-        texts = {CONFIG: self.config.to_toml(), "state.json": json.dumps(state)}
-        save_folder(folder, texts, tensors)
+                f"{source} was trained with another encoder than {config.encoder.weights!r}; "
+                "set encoder.weights to its folder"
+            )
+    return networks

@@ -15,12 +15,15 @@ from typing import NamedTuple
 import msgpack
 
 from common.delivery import DuplicateFilter
-from common.messages import Origin
+from common.files import sync_folder, write_atomically
+from common.messages import Episode, Origin
 
 log = logging.getLogger(__name__)
 HEADER = struct.Struct("<4sII")
 """Magic, length and CRC-32 of the record that follows."""
 MAGIC = b"NVQ1"
+LARGEST = 2 * Episode.max_bytes
+"""More bytes than a record has."""
 
 
 class Record(NamedTuple):
@@ -34,12 +37,20 @@ class Record(NamedTuple):
 
 
 class EpisodeLog:
-    """Appends survive the death of the process; whole segments go when the ring no longer needs them."""
+    """Appends survive the death of the process; whole segments go when the ring no longer needs them.
 
-    def __init__(self, folder: Path, capacity: int, segment_bytes: int = 64 * 2**20) -> None:
+    With `sync` they survive that of the host too, once `commit` has returned.
+    """
+
+    def __init__(
+        self, folder: Path, capacity: int, segment_bytes: int = 64 * 2**20, sync: bool = False
+    ) -> None:
         self.seen = DuplicateFilter()
         self.env_steps = self.episodes = 0
         self._folder, self._capacity, self._segment_bytes = folder, capacity, segment_bytes
+        self._sync, self._unsynced = sync, False
+        self.broken: OSError | None = None
+        """Why the disk may lack what was appended: nothing can be written or committed after that."""
         self._sizes: deque[tuple[Path, int]] = deque()
         """Closed segments, oldest first, with the transitions that each holds."""
         self._current = 0
@@ -48,7 +59,10 @@ class EpisodeLog:
         self._file = None if self._number == 0 else self._path().open("ab", buffering=0)
 
     def restore(self) -> Iterator[Record]:
-        """All records, oldest first; cuts a torn tail and says so. Exhaust it before the first append."""
+        """All whole records, oldest first; skips damage, cuts a torn tail, and says so.
+
+        Exhaust it before the first append.
+        """
         saved = self._folder / "seen.json"
         if saved.exists():
             self.seen.restore(json.loads(saved.read_text()))
@@ -66,27 +80,45 @@ class EpisodeLog:
                 self._sizes.append((path, transitions))
 
     def append(self, origin: Origin, length: int, payload: bytes) -> Record:
-        """Writes an episode of `length` transitions; it is on record when this returns.
+        """Writes an episode of `length` transitions; it is in the file when this returns.
 
         Raises OSError when it cannot be written, and leaves no trace of it then.
         """
+        if self.broken:
+            raise self.broken
         record = Record(origin, self.env_steps + length, self.episodes + 1, length, payload)
         body = msgpack.packb([*origin.model_dump().values(), *record[1:]])
         if self._file is None or self._file.tell() >= self._segment_bytes:
             self._next_segment()
         assert self._file is not None
-        data = HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body
+        data = memoryview(HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body)
         start = self._file.seek(0, os.SEEK_END)  # after a cut the position lies beyond the end
         try:
-            if self._file.write(data) != len(data):
-                raise OSError(f"{self._path()}: only a part could be written; is the disk full?")
+            while data:  # a disk that fills up takes a part, and says why at the next attempt
+                data = data[self._file.write(data) :]
         except OSError:
             self._file.truncate(start)
             raise
         self.seen.add(origin)
         self.env_steps, self.episodes = record.env_steps, record.episodes
         self._current += length
+        self._unsynced = self._sync
         return record
+
+    def commit(self) -> None:
+        """Waits, with `sync`, until the disk has all that was appended: one wait for many appends.
+
+        After an OSError what the disk has is unknown, whatever it says the next time: the log is `broken`.
+        """
+        if self.broken:
+            raise self.broken
+        if self._unsynced and self._file is not None:
+            try:
+                os.fdatasync(self._file.fileno())
+            except OSError as error:
+                self.broken = error
+                raise
+            self._unsynced = False
 
     def close(self) -> None:
         """Closes the current segment."""
@@ -97,9 +129,9 @@ class EpisodeLog:
         return self._folder / f"{self._number:08d}.log"
 
     def _next_segment(self) -> None:
-        part = self._folder / "seen.json.part"  # what the dropped segments knew of duplicates stays known
-        part.write_text(json.dumps(self.seen.state()))
-        part.replace(self._folder / "seen.json")
+        self.commit()
+        # what the dropped segments knew of duplicates stays known
+        write_atomically(self._folder / "seen.json", json.dumps(self.seen.state()).encode())
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -112,21 +144,33 @@ class EpisodeLog:
         self._number += 1
         self._current = 0
         self._file = self._path().open("ab", buffering=0)
+        if self._sync:
+            sync_folder(self._folder)
 
     def _read(self, path: Path) -> Iterator[Record]:
-        end = 0
-        with path.open("r+b") as file:
-            while True:
-                header = file.read(HEADER.size)
-                if not header:
-                    return
-                magic, size, crc = HEADER.unpack(header) if len(header) == HEADER.size else (b"", 0, 0)
-                body = file.read(size) if magic == MAGIC else b""
-                if magic != MAGIC or len(body) < size or zlib.crc32(body) != crc:
-                    break
-                actor, boot, seq, env_steps, episodes, length, payload = msgpack.unpackb(body)
-                yield Record(Origin(actor=actor, boot=boot, seq=seq), env_steps, episodes, length, payload)
-                end = file.tell()
-            lost = path.stat().st_size - end
-            log.warning("%s: cut a torn tail of %d bytes after its last whole record", path, lost)
-            file.truncate(end)
+        whole = path.stat().st_size
+        with path.open("rb") as file:
+            data = file.read(self._segment_bytes + LARGEST)
+        position = end = 0
+        while (start := data.find(MAGIC, position)) >= 0:
+            body = _body(data, start)
+            if body is None:
+                position = start + 1
+                continue
+            if start > end:
+                log.warning("%s: skipped %d damaged bytes before a whole record", path, start - end)
+            actor, boot, seq, env_steps, episodes, length, payload = msgpack.unpackb(body)
+            yield Record(Origin(actor=actor, boot=boot, seq=seq), env_steps, episodes, length, payload)
+            position = end = start + HEADER.size + len(body)
+        if end < whole:
+            log.warning("%s: cut a torn tail of %d bytes after its last whole record", path, whole - end)
+            os.truncate(path, end)
+
+
+def _body(data: bytes, start: int) -> bytes | None:
+    """The body of the record that begins at `start`; None when it is not whole."""
+    if len(data) - start < HEADER.size:
+        return None
+    _, size, crc = HEADER.unpack_from(data, start)
+    body = data[start + HEADER.size : start + HEADER.size + size]
+    return body if 0 < size == len(body) and zlib.crc32(body) == crc else None

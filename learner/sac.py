@@ -8,13 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
 from common.config import Config
+from common.errors import UsageError
 from common.networks import Perception, Policy, TwinCritic, load_state, state_of
-from common.observation import ObservationLayout
-from learner.optimizers import load_moments, moments_of
+from common.observation import ACTION_SIZE, Observation, ObservationLayout
+from learner.optimizers import FlatAdam, flatten, load_moments, moments_of
 from learner.replay.buffer import Batch
 
 WATCH_INTERVAL = 10
@@ -36,9 +38,17 @@ def td_target(reward: Tensor, discount: Tensor, q_next: Tensor, alpha: Tensor, l
     return reward + discount * (q_next.min(0).values - alpha * log_density)
 
 
-def critic_loss(q: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """J_Q: importance-weighted mean of (Q - target)^2 / 2, summed over the twins; q (2, B)."""
-    return (weight * 0.5 * (q - target) ** 2).mean(1).sum()
+def critic_loss(q: Tensor, target: Tensor, weight: Tensor, kind: str = "squared") -> Tensor:
+    """J_Q: importance-weighted mean of (Q - target)^2 / 2, summed over the twins; q (2, B).
+
+    With `kind` huber it is |Q - target| - 1/2 where that difference is larger than 1.
+    """
+    twins = target.expand_as(q)
+    if kind == "huber":
+        errors = F.huber_loss(q, twins, reduction="none")
+    else:
+        errors = 0.5 * F.mse_loss(q, twins, reduction="none")
+    return (weight * errors).mean(1).sum()
 
 
 def policy_loss(q: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
@@ -51,6 +61,14 @@ def temperature_loss(log_alpha: Tensor, log_density: Tensor, target_entropy: flo
     return -(log_alpha * (log_density + target_entropy)).mean()
 
 
+def pick_device(wanted: str) -> torch.device:
+    """The device of `learner.device`; raises UsageError for a GPU that is not there."""
+    there = torch.cuda.is_available()
+    if wanted == "cuda" and not there:
+        raise UsageError("learner.device = cuda, but torch finds no GPU; use auto or cpu")
+    return torch.device("cuda" if there and wanted != "cpu" else "cpu")
+
+
 class SAC:
     """Networks, targets and optimisers, updated from batches; what the learner checkpoints.
 
@@ -60,17 +78,19 @@ class SAC:
 
     def __init__(self, config: Config) -> None:
         self.config, self.updates = config, 0
+        self.device = pick_device(config.learner.device)
         self._generator = torch.Generator().manual_seed(config.seed)
         layout = ObservationLayout.of(config)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed + 1)
-            self.policy = Policy(layout, config.network)
-            self.critic = TwinCritic(layout, config.network)
-            self.perception = Perception(config)
+            self.policy = Policy(layout, config.network).to(self.device)
+            self.critic = TwinCritic(layout, config.network).to(self.device)
+            self.perception = Perception(config).to(self.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_perception.normalizer = self.perception.normalizer
-        self.log_alpha = torch.tensor(math.log(config.sac.initial_alpha), requires_grad=True)
+        initial = math.log(config.sac.initial_alpha)
+        self.log_alpha = torch.tensor(initial, device=self.device, requires_grad=True)
         self._modules = {
             "perception": self.perception,
             "policy": self.policy,
@@ -80,26 +100,36 @@ class SAC:
         if config.encoder.end_to_end:
             self._modules["target_perception"] = self.target_perception
         self._end_to_end = config.encoder.end_to_end
-        rate = config.sac.learning_rate
-        learned = [*self.critic.parameters(), *self.perception.parameters()]
-        self.optimizers = {
-            "critic": torch.optim.Adam(learned, rate, fused=True),
-            "policy": torch.optim.Adam(self.policy.parameters(), rate, fused=True),
-            "temperature": torch.optim.Adam([self.log_alpha], rate),
+        learned = {
+            "critic": [*self.critic.parameters(), *self.perception.parameters()],
+            "policy": self.policy.parameters(),
+            "temperature": [self.log_alpha],
         }
-        self._online: list[Tensor] = [*learned]
-        self._targets: list[Tensor] = [*self.target.parameters(), *self.target_perception.parameters()]
+        rate = config.sac.learning_rate
+        self.optimizers = {name: FlatAdam(parameters, rate) for name, parameters in learned.items()}
+        self._targets = flatten([*self.target.parameters(), *self.target_perception.parameters()])
 
     @property
     def alpha(self) -> Tensor:
         """The temperature, without gradient."""
         return self.log_alpha.detach().exp()
 
-    def update(self, batch: Batch) -> tuple[Losses, NDArray[np.float64]]:
-        """One gradient step on all that is due; returns figures and |TD error| (B,), the twins' mean."""
+    @property
+    def policy_due(self) -> bool:
+        """Whether the next update is one of the policy too."""
+        return self.updates % self.config.sac.policy_delay == 0
+
+    def update(
+        self, batch: Batch, actor_batch: Observation | None = None
+    ) -> tuple[Losses, NDArray[np.float64]]:
+        """One gradient step on all that is due; returns figures and |TD error| (B,), the twins' mean.
+
+        With `actor_batch` policy and temperature learn from those observations in place of the batch's.
+        """
         sac = self.config.sac
         action, reward, discount, weight = (
-            torch.from_numpy(part) for part in (batch.action, batch.reward, batch.discount, batch.weight)
+            torch.from_numpy(part).to(self.log_alpha)
+            for part in (batch.action, batch.reward, batch.discount, batch.weight)
         )
         if self.updates % WATCH_INTERVAL == 0:
             self.perception.watch(batch.observation)
@@ -113,45 +143,41 @@ class SAC:
             )
         flat = self.perception(batch.observation)
         q = self.critic(flat, action)
-        loss = critic_loss(q, target, weight)
-        self._step("critic", loss)
+        loss = critic_loss(q, target, weight, sac.critic_loss)
+        self.optimizers["critic"].step(loss)
         policy, entropy = math.nan, math.nan
-        if self.updates % sac.policy_delay == 0:
+        if self.policy_due:
+            if actor_batch is not None:
+                with torch.no_grad():
+                    flat = self.perception(actor_batch)
             policy, entropy = self._update_policy(flat.detach())
         self.updates += 1
         self._update_targets()
-        errors = (q.detach() - target).abs().mean(0).double().numpy()
+        errors = (q.detach() - target).abs().mean(0).double().cpu().numpy()
         figures = Losses(loss.item(), q.detach().mean().item(), policy, entropy, self.alpha.item())
         return figures, errors
 
     def _update_policy(self, flat: Tensor) -> tuple[float, float]:
         sac = self.config.sac
         action, log_density = self.policy.sample(flat, self._noise(len(flat)))
-        self.critic.requires_grad_(False)
         loss = policy_loss(self.critic(flat, action), self.alpha, log_density)
-        self._step("policy", loss)
-        self.critic.requires_grad_(True)
-        self._step("temperature", temperature_loss(self.log_alpha, log_density.detach(), sac.target_entropy))
+        self.optimizers["policy"].step(loss)
+        log_density = log_density.detach()
+        self.optimizers["temperature"].step(temperature_loss(self.log_alpha, log_density, sac.target_entropy))
         if sac.alpha_floor > 0:
             with torch.no_grad():
                 self.log_alpha.clamp_(min=math.log(sac.alpha_floor))
-        return loss.item(), -log_density.detach().mean().item()
+        return loss.item(), -log_density.mean().item()
 
     def _update_targets(self) -> None:
-        sac = self.config.sac
-        with torch.no_grad():
-            if sac.target == "soft":
-                torch._foreach_lerp_(self._targets, self._online, sac.tau)
-            elif self.updates % sac.target_interval == 0:
-                torch._foreach_copy_(self._targets, self._online)
-
-    def _step(self, name: str, loss: Tensor) -> None:
-        self.optimizers[name].zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.optimizers[name].step()
+        sac, online = self.config.sac, self.optimizers["critic"].vector
+        if sac.target == "soft":
+            self._targets.lerp_(online, sac.tau)
+        elif self.updates % sac.target_interval == 0:
+            self._targets.copy_(online)
 
     def _noise(self, size: int) -> Tensor:
-        return torch.randn(size, 2, generator=self._generator)
+        return torch.randn(size, ACTION_SIZE, generator=self._generator).to(self.log_alpha)
 
     def policy_state(self) -> dict[str, Tensor]:
         """What an actor needs."""
@@ -168,16 +194,20 @@ class SAC:
         networks["log_alpha"] = self.log_alpha.detach()
         moments: dict[str, Tensor] = {}
         for name, optimizer in self.optimizers.items():
-            moments |= moments_of(name, optimizer)
+            moments |= moments_of(name, optimizer.adam)
         moments["generator"] = self._generator.get_state()
         return networks, moments
 
+    def load_weights(self, networks: dict[str, Tensor]) -> None:
+        """The networks alone; raises ValueError naming the first tensor that does not fit."""
+        load_state(networks, **self._modules)
+
     def load(self, networks: dict[str, Tensor], moments: dict[str, Tensor], updates: int) -> None:
         """Takes what `state` gave; raises ValueError naming the first tensor that does not fit."""
-        load_state(networks, **self._modules)
+        self.load_weights(networks)
         with torch.no_grad():
             self.log_alpha.copy_(networks["log_alpha"])
         for name, optimizer in self.optimizers.items():
-            load_moments(name, optimizer, moments)
+            load_moments(name, optimizer.adam, moments)
         self._generator.set_state(moments["generator"])
         self.updates = updates

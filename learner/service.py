@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import queue
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,9 +19,10 @@ import torch
 import zenoh
 from torch.utils.tensorboard import SummaryWriter
 
-from common.bus import Keys, QueryServer, announce, publish, serve
+from common.bus import BUSY, Keys, QueryServer, announce, publish, serve
 from common.contract import check_digest, contract_encoder, make_contract
 from common.delivery import unpack_header
+from common.errors import RunError
 from common.files import write_atomically
 from common.messages import (
     ENDINGS,
@@ -26,6 +30,7 @@ from common.messages import (
     ContractReply,
     Episode,
     Message,
+    MessageError,
     Nothing,
     Version,
     decode,
@@ -33,15 +38,18 @@ from common.messages import (
 )
 from common.networks import state_of
 from common.observation import ObservationLayout
-from common.resources import check_memory
+from common.resources import check_memory, learner_threads
 from common.telemetry import Rate, Reporter
 from common.weights import pack
 from learner.checkpoint import RunDirectory
+from learner.learner import Learner
 from learner.log import EpisodeLog
 from learner.replay.buffer import Replay
-from learner.sac import SAC, Losses
+from learner.sac import Losses
 
 log = logging.getLogger(__name__)
+BEST_OF = 200
+"""Random tasks whose success decides which policy is the best so far; at least half of them must be there."""
 
 
 class Progress:
@@ -52,6 +60,15 @@ class Progress:
         """(ending, return, length, category)."""
         self.staleness: deque[int] = deque(maxlen=100)
         self.losses: deque[Losses] = deque(maxlen=200)
+        self.random_tasks: deque[bool] = deque(maxlen=BEST_OF)
+        """Whether tasks of the whole distribution, which no curriculum chose, succeeded."""
+
+    def add(self, episode: Episode) -> None:
+        """Takes note of an episode."""
+        item = (episode.ending, float(episode.reward.sum()), episode.length, episode.category)
+        self.recent.append(item)
+        if episode.category in ("random", "unserved"):
+            self.random_tasks.append(episode.ending == "success")
 
     def success(self, last: int) -> float:
         """Share of successes among the last episodes; NaN before the first."""
@@ -61,6 +78,8 @@ class Progress:
     def figures(self) -> dict[str, float]:
         """Scalars under fixed names, as for TensorBoard; only those that exist yet."""
         scalars = {"charts/success_100": self.success(100), "charts/success_500": self.success(500)}
+        if len(self.random_tasks) >= BEST_OF // 2:
+            scalars["charts/success_random"] = float(np.mean(self.random_tasks))
         if self.recent:
             scalars["charts/episodic_return"] = float(np.mean([item[1] for item in self.recent]))
             scalars["charts/episodic_length"] = float(np.mean([item[2] for item in self.recent]))
@@ -91,88 +110,102 @@ class LearnerService:
 
     def __init__(self, session: zenoh.Session, run: RunDirectory, minutes: float = math.inf) -> None:
         config = run.config
-        torch.set_num_threads(config.learner.threads)
+        torch.set_num_threads(learner_threads(config.learner.threads, os.cpu_count() or 1))
         self.config, self.run_directory, self._session = config, run, session
         self.keys = Keys(run.name)
         self._token = announce(session, self.keys, "learner", "learner")
-        self.layout = ObservationLayout.of(config)
         self._minutes = minutes
         self._check_memory()
-        self.replay = Replay(
-            config.replay,
-            self.layout,
-            config.world.max_episode_steps,
-            np.random.default_rng([config.seed, 1]),
-        )
-        self.sac = SAC(config)
+        self.learner = Learner(config)
+        log.info("SAC on %s, %d thread(s) of torch", self.learner.sac.device, torch.get_num_threads())
         self.contract = make_contract(run.name, config, run.encoder)
         frozen = not config.encoder.end_to_end
         self._frozen = state_of(encoder=contract_encoder(self.contract, config)) if frozen else {}
         self._epoch = run.next_epoch()
-        self._log = EpisodeLog(run.folder / "log", config.replay.capacity)
+        sync = config.learner.durability == "host"
+        self._log = EpisodeLog(run.folder / "log", config.replay.capacity, sync=sync)
         self.progress = Progress()
+        self._best = run.best_score
+        self._failed_writes, self._complained = 0, -math.inf
         self._restore()
-        self._inbox: queue.SimpleQueue[Episode] = queue.SimpleQueue()
+        self._accepted = self.learner.limiter.inserted
+        """Transitions in the log, those that wait in the inbox included."""
+        self._inbox: queue.SimpleQueue[tuple[Episode, int]] = queue.SimpleQueue()
         self._blobs: dict[str, bytes] = {}
         self._blobs_lock = threading.Lock()
         self._publish()
         every = config.learner.snapshot_steps
         self._snapshot_due = (self._log.env_steps // every + 1) * every
         self._servers = [
-            QueryServer(session, self.keys.trajectory, self._take),
+            QueryServer(session, self.keys.trajectory, self._take, commit=self._log.commit),
             serve(session, self.keys.contract, Nothing, self._answer_contract),
             QueryServer(session, self.keys.weights("policy"), lambda *_: self._answer_weights("policy")),
             QueryServer(session, self.keys.weights("critic"), lambda *_: self._answer_weights("critic")),
         ]
         self._reporter = Reporter(session, self.keys, "learner", "learner")
-        self._board = SummaryWriter(str(run.folder / "tensorboard"))
+        self._board: SummaryWriter | None = None
         self._began: float | None = None
         self._ended = time.monotonic()
-        self._first_update_from = self._log.env_steps
-        self._updates_before = self.sac.updates
+
+    @property
+    def updates(self) -> int:
+        """SAC updates of the run so far."""
+        return self.learner.sac.updates
 
     def run(self) -> None:
-        """Learns until SystemExit, or until the minutes since the first episode are over."""
+        """Learns until SystemExit, or until the minutes since the first episode are over.
+
+        Raises RunError when it cannot go on.
+        """
         rates = Rate(), Rate()
         last_publish = last_checkpoint = last_board = time.monotonic()
         while not self._over():
             self._ingest()
             now = time.monotonic()
-            if self._update_due():
-                self._update()
-            else:
+            losses = self.learner.update(self._log.env_steps)
+            if losses is None:
                 time.sleep(0.002)
+            else:
+                self.progress.losses.append(losses)
             if now - last_publish >= self.config.learner.publish_seconds:
                 last_publish = now
                 self._publish()
             if now - last_checkpoint >= self.config.learner.checkpoint_seconds:
                 last_checkpoint = now
-                self.run_directory.save(self.sac, self._frozen, self._log.env_steps)
+                self._try("a checkpoint", self._save)
             if self._log.env_steps >= self._snapshot_due:
-                self._snapshot(f"{self._log.env_steps:09d}")
+                self._try("a snapshot", partial(self._snapshot, f"{self._log.env_steps:09d}"))
                 self._snapshot_due += self.config.learner.snapshot_steps
             if self._reporter.due:
-                self._report(rates[0].read(self._log.env_steps), rates[1].read(self.sac.updates))
+                self._report(rates[0].read(self._log.env_steps), rates[1].read(self.updates))
             if now - last_board >= 5.0:
                 last_board = now
                 speed = {"charts/SPS": rates[0].value, "charts/UPS": rates[1].value}
-                for name, value in (self.progress.figures() | speed).items():
-                    self._board.add_scalar(name, value, self._log.env_steps)
-        log.info("the time is over after %d updates", self.sac.updates)
+                self._try("the curves", partial(self._draw, self.progress.figures() | speed))
+        log.info("the time is over after %d updates", self.updates)
 
     def close(self) -> None:
-        """Takes no more episodes, then writes checkpoint, final snapshot and summary."""
+        """Takes no more episodes, then writes checkpoint, final snapshot and summary.
+
+        Raises RunError when they cannot be written.
+        """
         self._ended = time.monotonic()
         for server in self._servers:
             server.close()
         self._ingest()
         self._log.close()
-        self.run_directory.save(self.sac, self._frozen, self._log.env_steps)
-        self._snapshot("final")
-        self._board.close()
-        write_atomically(
-            self.run_directory.folder / "summary.json", json.dumps(self.summary(), indent=1).encode()
-        )
+        folder = self.run_directory.folder
+        try:
+            self._save()
+            self._snapshot("final")
+            if self._board:
+                self._board.close()
+            write_atomically(folder / "summary.json", json.dumps(self.summary(), indent=1).encode())
+        except OSError as error:
+            raise RunError(
+                f"cannot write the last checkpoint to {folder}: {error.strerror}; "
+                "the one before it and all episodes are whole, and the run resumes from them"
+            ) from None
 
     def summary(self) -> dict[str, Any]:
         """The run in numbers."""
@@ -180,7 +213,7 @@ class LearnerService:
             "run": self.run_directory.name,
             "env_steps": self._log.env_steps,
             "episodes": self._log.episodes,
-            "updates": self.sac.updates,
+            "updates": self.updates,
             "minutes": round((self._ended - self._began) / 60, 3) if self._began else 0.0,
             "figures": {name: round(value, 5) for name, value in self.progress.figures().items()},
             "refused": dict(sum((server.refused for server in self._servers), Counter())),
@@ -188,77 +221,107 @@ class LearnerService:
 
     def _check_memory(self) -> None:
         config = self.config
-        need = Replay.bytes_needed(config.replay, self.layout, config.world.max_episode_steps)
+        steps = config.world.max_episode_steps
+        need = Replay.bytes_needed(config.replay, ObservationLayout.of(config), steps)
         log.info("replay of %d transitions takes up to %.2f GB", config.replay.capacity, need / 1e9)
         check_memory(f"replay.capacity = {config.replay.capacity}", need, "lower it")
 
     def _restore(self) -> None:
-        self.run_directory.restore(self.sac)
         for record in self._log.restore():
-            self._store(decode(Episode, record.payload))
+            episode = decode(Episode, record.payload)
+            self.learner.insert(episode, record.env_steps - record.length, restored=True)
+            self.progress.add(episode)
+        self.run_directory.restore(self.learner)
         if self._log.episodes:
             log.info(
                 "resumed with %d episodes (%d steps), %d transitions in the replay, %d updates",
                 self._log.episodes,
                 self._log.env_steps,
-                self.replay.transitions,
-                self.sac.updates,
+                self.learner.replay.transitions,
+                self.updates,
             )
         else:
-            self._snapshot("initial")
+            self._try("a snapshot", partial(self._snapshot, "initial"))
 
     def _take(self, payload: bytes, attachment: bytes) -> bytes:
-        """From the bus, in a thread of its own: an episode is acknowledged when it is in the log."""
+        """From the bus, in a thread of its own: an episode is acknowledged when it is in the log.
+
+        It is sent again later when the disk is full, or when the limiter holds the actors back.
+        """
         origin = unpack_header(attachment, payload)
         if self._log.seen.seen(origin):
             return encode(Acknowledgement(duplicate=True))
         episode = decode(Episode, payload)
         check_digest(self.contract.digest, episode.digest)
-        episode.check_layout(self.layout, self.config.world.max_episode_steps)
-        self._log.append(origin, episode.length, payload)
-        self._inbox.put(episode)
+        episode.check_layout(self.learner.layout, self.config.world.max_episode_steps)
+        waiting = self._accepted - self.learner.limiter.inserted
+        if not self.learner.limiter.may_insert(waiting + episode.length):
+            raise MessageError(BUSY)
+        try:
+            record = self._log.append(origin, episode.length, payload)
+        except OSError as error:
+            self._complain("an episode", error)
+            raise MessageError(BUSY) from None
+        self._accepted += episode.length
+        self._inbox.put((episode, record.env_steps - record.length))
         return encode(Acknowledgement())
 
     def _ingest(self) -> None:
         while not self._inbox.empty():
-            episode = self._inbox.get()
+            episode, first_step = self._inbox.get()
             if self._began is None:
                 self._began = time.monotonic() - episode.length * self.config.world.control_period
-            self._store(episode)
+            self.learner.insert(episode, first_step)
+            self.progress.add(episode)
             if episode.first_version.epoch == self._epoch:
-                self.progress.staleness.append(self.sac.updates - episode.first_version.counter)
+                self.progress.staleness.append(self.updates - episode.first_version.counter)
+        if self._log.broken is not None:
+            raise RunError(
+                f"the disk could not confirm the log of episodes in {self.run_directory.folder} "
+                f"({self._log.broken.strerror}); what was not acknowledged is sent again after a restart"
+            )
 
-    def _store(self, episode: Episode) -> None:
-        self.replay.add(episode)
-        item = (episode.ending, float(episode.reward.sum()), episode.length, episode.category)
-        self.progress.recent.append(item)
+    def _try(self, what: str, write: Callable[[], None]) -> None:
+        """Writes what can be written again later: a full disk must not end the training."""
+        try:
+            write()
+        except OSError as error:
+            self._complain(what, error)
 
-    def _update_due(self) -> bool:
-        """Within the ratio of updates to steps, counted from this start: a resumed run does not catch up."""
-        if self.replay.transitions < self.config.replay.warmup_steps:
-            self._first_update_from = self._log.env_steps
-            return False
-        steps = self._log.env_steps - self._first_update_from
-        return self.sac.updates - self._updates_before < self.config.learner.updates_per_step * steps
+    def _complain(self, what: str, error: OSError) -> None:
+        self._failed_writes += 1
+        now = time.monotonic()
+        if now - self._complained >= 5.0:
+            self._complained = now
+            log.error(
+                "cannot write %s to %s: %s; training goes on, and it is tried again",
+                what,
+                self.run_directory.folder,
+                error.strerror or error,
+            )
 
-    def _update(self) -> None:
-        config = self.config
-        done = min(1.0, self._log.env_steps / config.replay.importance_steps)
-        start, end = config.replay.importance_start, config.replay.importance_end
-        batch = self.replay.sample(
-            config.sac.batch_size, config.sac.n_step, config.sac.gamma, start + done * (end - start)
-        )
-        losses, errors = self.sac.update(batch)
-        if not (math.isfinite(losses.critic) and math.isfinite(losses.alpha)):
-            raise ArithmeticError(f"losses are not finite at update {self.sac.updates}: {losses}")
-        self.replay.update_priorities(batch, errors)
-        self.progress.losses.append(losses)
+    def _save(self) -> None:
+        self.run_directory.save(self.learner, self._frozen, self._epoch, self._log.env_steps)
+        score = self.progress.figures().get("charts/success_random", -math.inf)
+        if score > self._best:
+            self._snapshot("best", success_random=score)
+            self._best = score
+
+    def _draw(self, scalars: dict[str, float]) -> None:
+        if self._board is None:
+            self._board = SummaryWriter(str(self.run_directory.folder / "tensorboard"))
+        try:
+            for name, value in scalars.items():
+                self._board.add_scalar(name, value, self._log.env_steps)
+        except OSError:
+            self._board = None  # its thread has ended with the error; the next attempt begins a new file
+            raise
 
     def _publish(self) -> None:
-        version = Version(epoch=self._epoch, counter=self.sac.updates)
+        version = Version(epoch=self._epoch, counter=self.updates)
         blobs = {
-            "policy": encode(pack(version, self.sac.policy_state())),
-            "critic": encode(pack(version, self.sac.critic_state())),
+            "policy": encode(pack(version, self.learner.sac.policy_state())),
+            "critic": encode(pack(version, self.learner.sac.critic_state())),
         }
         with self._blobs_lock:
             self._blobs = blobs
@@ -271,9 +334,9 @@ class LearnerService:
     def _answer_contract(self, question: Message) -> ContractReply:
         return self.contract
 
-    def _snapshot(self, name: str) -> None:
-        networks = self.sac.policy_state() | self._frozen
-        state = {"updates": self.sac.updates, "env_steps": self._log.env_steps}
+    def _snapshot(self, name: str, **figures: float) -> None:
+        networks = self.learner.sac.policy_state() | self._frozen
+        state = {"updates": self.updates, "env_steps": self._log.env_steps, **figures}
         self.run_directory.snapshot(name, networks, state)
 
     def _over(self) -> bool:
@@ -283,10 +346,11 @@ class LearnerService:
         values: dict[str, float | int | str] = {
             "env_steps": self._log.env_steps,
             "episodes": self._log.episodes,
-            "updates": self.sac.updates,
+            "updates": self.updates,
             "steps_per_s": round(steps_per_s, 1),
             "updates_per_s": round(updates_per_s, 1),
-            "replay": self.replay.transitions,
+            "replay": self.learner.replay.transitions,
+            "failed_writes": self._failed_writes,
             "elapsed_s": round(time.monotonic() - self._began, 1) if self._began else 0.0,
             "refused": sum(sum(server.refused.values()) for server in self._servers),
         }

@@ -10,6 +10,7 @@ import zenoh
 
 from common.bus import (
     BUSY,
+    GROUP,
     INTERNAL_ERROR,
     Keys,
     NoAnswerError,
@@ -273,7 +274,6 @@ def test_a_full_inbox_refuses_with_busy_at_once_and_keeps_what_it_took(hub, clie
     first, first_result = in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"1", timeout=30.0))
     assert gate.entered.wait(10)
     others = [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"2", timeout=30.0)) for _ in range(3)]
-    wait_until(lambda: server.refused[BUSY] == 2)
     wait_until(lambda: sum(bool(result) for _, result in others) == 2)
     assert sorted(str(result[0]) for _, result in others if result) == [BUSY, BUSY]
     assert all(isinstance(result[0], RefusedError) for _, result in others if result)
@@ -283,6 +283,7 @@ def test_a_full_inbox_refuses_with_busy_at_once_and_keeps_what_it_took(hub, clie
         thread.join(10)
     assert first_result == [b"1"]
     assert [result[0] for _, result in others if not isinstance(result[0], RefusedError)] == [b"2"]
+    assert server.refused == {}, "who comes again is not refused"
     server.close()
 
 
@@ -292,7 +293,7 @@ def test_closing_behind_a_stuck_handler_and_a_full_inbox_returns(hub, client):
     threads = [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"", timeout=30.0))]
     assert gate.entered.wait(10)
     threads += [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"", timeout=30.0)) for _ in range(2)]
-    wait_until(lambda: server.refused[BUSY] == 1)
+    wait_until(lambda: any(result for _, result in threads))
     closing, done = in_thread(server.close)
     closing.join(8)
     assert done == [None]
@@ -300,6 +301,178 @@ def test_closing_behind_a_stuck_handler_and_a_full_inbox_returns(hub, client):
     for thread, _ in threads:
         thread.join(10)
         assert not thread.is_alive()
+
+
+class Committed:
+    """A server with `commit`: what it handled, what had been handled at each commit, and two gates."""
+
+    def __init__(self, session: zenoh.Session, capacity: int = 256) -> None:
+        self.handled: list[bytes] = []
+        self.commits: list[int] = []
+        self.failing = False
+        self.handling, self.committing = Gate(), Gate()
+        self.committing.opened.set()
+        self.server = QueryServer(session, KEYS.trajectory, self._handle, capacity, self._commit)
+
+    def _handle(self, payload: bytes, attachment: bytes) -> bytes:
+        if payload == b"refuse":
+            raise MessageError("reason: refuse")
+        self.handling(payload, attachment)
+        self.handled.append(payload)
+        return payload
+
+    def _commit(self) -> None:
+        self.commits.append(len(self.handled))
+        self.committing(b"", b"")
+        if self.failing:
+            raise OSError("Input/output error")
+
+    def queue(self, client: zenoh.Session, count: int) -> list[tuple[threading.Thread, list]]:
+        """Asks so many times from threads of their own, until all are in the server's queue."""
+        waiting = self.server._inbox.qsize()
+        asked = [
+            in_thread(lambda i=i: ask_bytes(client, KEYS.trajectory, b"%d" % i, timeout=30.0))
+            for i in range(count)
+        ]
+        wait_until(lambda: self.server._inbox.qsize() == waiting + count)
+        return asked
+
+    def stand_still(self, client: zenoh.Session) -> tuple[threading.Thread, list]:
+        """Asks once, and returns when that keeps the server busy."""
+        asked = in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"first", timeout=30.0))
+        assert self.handling.entered.wait(10)
+        return asked
+
+
+def results(asked: list[tuple[threading.Thread, list]]) -> list:
+    """What each of the threads got, once all have ended."""
+    for thread, _ in asked:
+        thread.join(15)
+        assert not thread.is_alive()
+    return [result[0] for _, result in asked]
+
+
+def test_queries_that_wait_together_are_answered_after_one_commit(hub, client):
+    committed = Committed(hub)
+    first = committed.stand_still(client)
+    others = committed.queue(client, 20)
+    committed.handling.opened.set()
+    assert results([first]) == [b"first"]
+    assert results(others) == [b"%d" % i for i in range(20)]
+    assert committed.commits == [1, 21], "one for the first, which was alone, and one for all that waited"
+    committed.server.close()
+
+
+def test_more_queries_than_a_group_take_more_commits_in_the_order_of_arrival(hub, client):
+    committed = Committed(hub)
+    first = committed.stand_still(client)
+    others = committed.queue(client, GROUP + 6)
+    committed.handling.opened.set()
+    assert sorted(results([first, *others])) == sorted([b"first", *(b"%d" % i for i in range(GROUP + 6))])
+    assert committed.commits == [1, 1 + GROUP, 7 + GROUP]
+    committed.server.close()
+
+
+def test_no_reply_leaves_before_the_commit_has_returned(hub, client):
+    committed = Committed(hub)
+    committed.committing.opened.clear()
+    committed.handling.opened.set()
+    first = in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"first", timeout=30.0))
+    assert committed.committing.entered.wait(10)
+    others = committed.queue(client, 5)
+    # a round trip on another key, so that a reply which had left would be here
+    other = QueryServer(hub, KEYS.contract, lambda payload, _: payload)
+    for _ in range(20):
+        assert ask_bytes(client, KEYS.contract, b"ping") == b"ping"
+    assert committed.handled == [b"first"]
+    assert [result for _, result in (first, *others)] == [[]] * 6
+    committed.committing.opened.set()
+    assert results([first, *others]) == [b"first", *(b"%d" % i for i in range(5))]
+    assert committed.commits == [1, 6]
+    committed.server.close()
+    other.close()
+
+
+def test_each_of_a_group_gets_its_own_answer_the_refused_one_too(hub, client):
+    committed = Committed(hub)
+    first = committed.stand_still(client)
+    asked = [in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"refuse", timeout=30.0))]
+    wait_until(lambda: committed.server._inbox.qsize() == 1)
+    asked += committed.queue(client, 3)
+    committed.handling.opened.set()
+    refused, *answers = results(asked)
+    assert isinstance(refused, RefusedError) and str(refused) == "reason: refuse"
+    assert answers == [b"0", b"1", b"2"]
+    assert results([first]) == [b"first"]
+    assert committed.commits == [1, 4]
+    assert committed.server.refused == {"reason": 1}
+    committed.server.close()
+
+
+def test_when_the_commit_fails_all_that_waited_for_it_are_told_and_the_server_lives_on(hub, client, caplog):
+    committed = Committed(hub)
+    first = committed.stand_still(client)
+    others = committed.queue(client, 7)
+    committed.failing = True
+    committed.handling.opened.set()
+    for found in results([first, *others]):
+        assert isinstance(found, RefusedError)
+        assert str(found) == INTERNAL_ERROR
+    assert committed.commits == [1, 8]
+    assert "Input/output error" in caplog.text, "the cause stays on this side"
+    committed.failing = False
+    assert ask_bytes(client, KEYS.trajectory, b"again") == b"again"
+    assert committed.server.refused == {INTERNAL_ERROR: 8}
+    committed.server.close()
+
+
+def test_closing_answers_what_waits_for_a_commit_and_ends_the_thread(hub, client):
+    committed = Committed(hub)
+    first = committed.stand_still(client)
+    others = committed.queue(client, 5)
+    closing, done = in_thread(committed.server.close)
+    wait_until(lambda: committed.server._inbox.qsize() == 6, what="the end in the queue, behind the others")
+    committed.handling.opened.set()
+    closing.join(10)
+    assert done == [None]
+    wait_until(lambda: not committed.server._thread.is_alive(), what="the thread's end")
+    assert results([first, *others]) == [b"first", *(b"%d" % i for i in range(5))]
+    assert committed.commits == [1, 6]
+    with pytest.raises(NoAnswerError):
+        ask_bytes(client, KEYS.trajectory, b"late", timeout=5.0)
+
+
+def test_closing_during_a_commit_that_stands_still_returns(hub, client):
+    committed = Committed(hub)
+    committed.committing.opened.clear()
+    committed.handling.opened.set()
+    first = in_thread(lambda: ask_bytes(client, KEYS.trajectory, b"first", timeout=30.0))
+    assert committed.committing.entered.wait(10)
+    closing, done = in_thread(committed.server.close)
+    closing.join(8)
+    assert done == [None]
+    committed.committing.opened.set()
+    assert results([first]) == [b"first"]
+    wait_until(lambda: not committed.server._thread.is_alive(), what="the thread's end")
+
+
+def test_busy_is_no_refusal_that_counts_or_is_logged_from_a_handler_either(hub, client, caplog):
+    answers = iter([BUSY, BUSY, "contract differs", None])
+
+    def handler(payload: bytes, _: bytes) -> bytes:
+        if (reason := next(answers)) is not None:
+            raise MessageError(reason)
+        return payload
+
+    server = QueryServer(hub, KEYS.trajectory, handler)
+    for reason in (BUSY, BUSY, "contract differs"):
+        with pytest.raises(RefusedError, match=f"^{reason}$"):
+            ask_bytes(client, KEYS.trajectory, b"x")
+    assert ask_bytes(client, KEYS.trajectory, b"x") == b"x"
+    assert server.refused == {"contract differs": 1}
+    assert BUSY not in caplog.text
+    assert "contract differs" in caplog.text
+    server.close()
 
 
 def test_malformed_messages_are_counted_by_reason_and_logged_at_most_once_a_second(hub, client, caplog):

@@ -101,6 +101,8 @@ PAPER = {  # facts.md, sections 2 and 3
     "sac.learning_rate": 2e-4,
     "sac.batch_size": 64,
     "sac.n_step": 1,
+    "sac.critic_loss": "squared",
+    "sac.actor_batch": "critic",
     "sac.target": "hard",
     "sac.target_interval": 1000,
     "sac.policy_delay": 1,
@@ -113,7 +115,8 @@ PAPER = {  # facts.md, sections 2 and 3
     "replay.importance_end": 0.6,
     "replay.importance_steps": 5_000_000,
     "replay.warmup_steps": 15_000,
-    "learner.updates_per_step": 0.25,
+    "replay.samples_per_insert": 16.0,
+    "replay.hold_actors": True,
     "learner.snapshot_steps": 25_000,
     "actor.worlds": 9,
     "actor.refresh": "episode",
@@ -169,6 +172,22 @@ def test_smoke_preset_is_small():
     assert config.replay.warmup_steps <= 200
 
 
+@pytest.mark.parametrize(("preset", "updates"), [("paper", 0.25), ("fast", 0.5), ("smoke", 0.5)])
+def test_presets_sample_so_much_per_transition_that_they_make_that_many_updates_of_it(preset, updates):
+    config = resolve(preset)
+    assert config.replay.samples_per_insert / config.sac.batch_size == updates
+
+
+def test_only_the_paper_lets_its_actors_wait_for_the_learner():
+    assert [resolve(preset).replay.hold_actors for preset in PRESETS] == [True, False, False]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_an_acknowledged_episode_survives_the_process_unless_more_is_asked_for(preset):
+    assert resolve(preset).learner.durability == "process"
+    assert resolve(preset, overrides=("learner.durability=host",)).learner.durability == "host"
+
+
 def test_variants_change_the_curriculum_or_the_encoder():
     rnd, e2e = resolve("paper", variant="rnd"), resolve("paper", variant="e2e")
     assert (rnd.curriculum.algorithm, rnd.curriculum.gate.enabled) == ("rnd", False)
@@ -222,6 +241,8 @@ def test_file_of_a_run_resolves_to_the_same_configuration(tmp_path):
         ("replays=3", "replay"),
         ("curriculum.gate.window_=3", "curriculum.gate.window"),
         ("encoder.chanels=[1,2,3,4]", "encoder.channels"),
+        ("replay.sample_per_insert=3", "replay.samples_per_insert"),
+        ("replay.hold_actor=true", "replay.hold_actors"),
     ],
 )
 def test_unknown_key_is_named_with_the_nearest_known_one(setting, nearest):
@@ -229,6 +250,11 @@ def test_unknown_key_is_named_with_the_nearest_known_one(setting, nearest):
     with pytest.raises(UsageError) as caught:
         resolve(overrides=(setting,))
     assert str(caught.value) == f"config key {key!r} does not exist; the nearest key is {nearest!r}"
+
+
+def test_the_updates_per_step_of_earlier_versions_are_no_key_any_more():
+    with pytest.raises(UsageError, match=r"config key 'learner\.updates_per_step' does not exist"):
+        resolve(overrides=("learner.updates_per_step=0.5",))
 
 
 def test_unknown_key_of_a_file_is_refused_too(tmp_path):
@@ -249,6 +275,14 @@ def test_unknown_key_of_a_file_is_refused_too(tmp_path):
         ("sac.batch_size=lots", r"'sac\.batch_size' = 'lots'.*integer"),
         ("sac.batch_size=1.5", r"'sac\.batch_size' = 1\.5.*integer"),
         ("sac.target=medium", r"'sac\.target' = 'medium'.*'soft' or 'hard'"),
+        ("sac.critic_loss=l1", r"'sac\.critic_loss' = 'l1'.*'squared' or 'huber'"),
+        ("sac.actor_batch=both", r"'sac\.actor_batch' = 'both'.*'critic' or 'uniform'"),
+        ("replay.samples_per_insert=0", r"'replay\.samples_per_insert' = 0.*greater than 0"),
+        ("replay.error_buffer=0", r"'replay\.error_buffer' = 0.*greater than 0"),
+        ("replay.error_buffer=inf", r"'replay\.error_buffer' = inf.*finite number"),
+        ("replay.hold_actors=maybe", r"'replay\.hold_actors' = 'maybe'.*valid boolean"),
+        ("replay.warmup_steps=0", r"'replay\.warmup_steps' = 0.*greater than or equal to 1"),
+        ("learner.durability=disk", r"'learner\.durability' = 'disk'.*'process' or 'host'"),
         ("encoder.frames_per_code=2", r"'encoder\.frames_per_code' = 2.*1 or 4"),
         ("encoder.channels=[1,2,3]", r"'encoder\.channels\.3'.*required"),
         ("world.camera.size=81", r"'world\.camera\.size' = 81.*multiple of 16"),
@@ -325,6 +359,9 @@ def test_override_cannot_relabel_the_preset_or_the_variant(setting):
         ("curriculum.gate={enabled=false, window=5}", "curriculum.gate.window", 5),
         ("world.reward.dolly_contact=-10", "world.reward.dolly_contact", -10.0),
         ("replay.capacity=10_000", "replay.capacity", 10_000),
+        ("replay.hold_actors=true", "replay.hold_actors", True),
+        ("replay.error_buffer=250", "replay.error_buffer", 250.0),
+        ("sac.actor_batch=uniform", "sac.actor_batch", "uniform"),
         ("world.obstacles.size=[0.5, 0.5]", "world.obstacles.size", (0.5, 0.5)),
         ("world.randomization.fixed=['all']", "world.randomization.fixed", ("all",)),
         (
@@ -412,6 +449,32 @@ def test_toml_round_trip_keeps_floats_to_the_bit(gamma, rate, branch, gate):
 def test_parse_refuses_what_is_not_toml():
     with pytest.raises(UsageError, match="the configuration is not TOML"):
         parse("][")
+
+
+def test_parse_of_some_sections_leaves_the_others_at_their_defaults():
+    config = resolve("paper", overrides=("sac.gamma=0.5", "replay.capacity=50_000"), seed=7)
+    found = parse(config.to_toml(), ("seed", "sac"))
+    assert (found.seed, found.sac) == (7, config.sac)
+    assert found == Config(seed=7, sac=config.sac)
+    assert found.replay.capacity != 50_000
+    assert parse(config.to_toml(), tuple(Config.model_fields)) == config
+
+
+def test_parse_of_some_sections_outlives_changes_in_the_others_only():
+    text = "[learner]\nupdates_per_step = 0.5\n[encoder]\nkind = 'residual'\n"
+    assert parse(text, ("encoder", "world")).encoder.kind == "residual"
+    assert parse(text, ("encoder", "world")).world == WorldConfig()
+    for sections in ((), ("learner",), ("encoder", "learner")):
+        with pytest.raises(UsageError, match=r"'learner\.updates_per_step' does not exist"):
+            parse(text, sections)
+    with pytest.raises(UsageError, match="the configuration is not TOML"):
+        parse("][", ("encoder",))
+
+
+def test_warm_up_that_fills_more_than_half_the_replay_is_refused():
+    assert resolve(overrides=("replay.capacity=4000",)).replay.warmup_steps == 2000
+    with pytest.raises(UsageError, match="warmup_steps must be at most half the capacity of 3999"):
+        resolve(overrides=("replay.capacity=3999",))
 
 
 def test_configuration_is_frozen_in_depth():

@@ -1,6 +1,7 @@
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.bus import QueryServer, open_client, open_hub
+from common.bus import BUSY, INTERNAL_ERROR, QueryServer, open_client, open_hub
 from common.delivery import DuplicateFilter, Sender, Spool, pack_header, unpack_header
 from common.messages import Acknowledgement, MessageError, Origin, TaskQuery, decode, encode
 from tests.helpers import wait_until
@@ -266,13 +267,118 @@ def test_busy_receiver_is_asked_again_until_it_has_room(hub, client, spool):
     for rival in rivals:
         rival.put(KEY, TaskQuery(cell=0))
     assert entered.wait(10)
-    wait_until(lambda: server.refused["BUSY"] >= 2, what="a second refusal of the same message")
+    # one is being handled, one waits behind it, and there is no room for the third
+    wait_until(lambda: [rival.held_back for rival in rivals].count(True) == 1)
     assert [rival.sent for rival in rivals] == [0, 0, 0]
     opened.set()
     assert [rival.close(patience=15) for rival in rivals] == [0, 0, 0]
     assert [rival.sent for rival in rivals] == [1, 1, 1]
     assert [rival.refused for rival in rivals] == [{}, {}, {}]
+    assert [rival.held_back for rival in rivals] == [False, False, False]
     server.close()
+
+
+class Answers:
+    """A receiver that answers as `mood` says, None being an acknowledgement, and counts what it was asked."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.mood: Exception | None = None
+        self.asked: list[int] = []
+        self.server = QueryServer(session, KEY, self._answer)
+
+    def _answer(self, payload: bytes, header: bytes) -> bytes:
+        self.asked.append(unpack_header(header, payload).seq)
+        if self.mood is not None:
+            raise self.mood
+        return encode(Acknowledgement())
+
+
+def test_sender_is_held_back_while_the_receiver_is_busy_until_the_next_acknowledgement(hub, client, spool):
+    answers = Answers(hub)
+    sender = Sender(client, spool, "a1", "b1")
+    assert not sender.held_back
+    sender.put(KEY, TaskQuery(cell=0))
+    wait_until(lambda: sender.sent == 1)
+    assert not sender.held_back
+    answers.mood = MessageError(BUSY)
+    sender.put(KEY, TaskQuery(cell=0))
+    sender.put(KEY, TaskQuery(cell=0))
+    wait_until(lambda: sender.held_back)
+    while len(answers.asked) < 4:  # asked again, with a pause between, it stays held back
+        assert sender.held_back
+        time.sleep(0.001)
+    assert (sender.sent, len(spool), sender.refused) == (1, 2, {})
+    answers.mood = None
+    wait_until(lambda: sender.sent == 3)
+    wait_until(lambda: not sender.held_back)
+    assert answers.asked[0] == 0
+    assert answers.asked[1:] == [1] * (len(answers.asked) - 2) + [2]
+    assert sender.close(patience=5) == 0
+    answers.server.close()
+
+
+@pytest.mark.parametrize(
+    ("mood", "final"),
+    [
+        (MessageError("contract differs in 'reward'"), True),
+        (MessageError("BUSY bee"), True),
+        (MessageError("busy"), True),
+        (OSError("no space left on device"), False),
+        (MessageError(INTERNAL_ERROR), False),
+    ],
+    ids=["refused", "busy in a reason", "lower case", "error within", "internal error"],
+)
+def test_other_errors_do_not_hold_the_sender_back(hub, client, spool, mood, final):
+    answers = Answers(hub)
+    answers.mood = mood
+    sender = Sender(client, spool, "a1", "b1")
+    sender.put(KEY, TaskQuery(cell=0))
+    while len(answers.asked) < 2:
+        assert not sender.held_back
+        if final and sender.refused:
+            break
+        time.sleep(0.001)
+    assert not sender.held_back
+    assert (sum(sender.refused.values()), len(spool)) == ((1, 0) if final else (0, 1))
+    answers.mood = None
+    assert sender.close(patience=10) == 0
+    answers.server.close()
+
+
+def test_sender_that_finds_nobody_is_not_held_back(hub, client, spool):
+    sender = Sender(client, spool, "a1", "b1", timeout=2.0)
+    sender.put(KEY, TaskQuery(cell=0))
+    wait_until(lambda: sender.waiting_since is not None)
+    assert not sender.held_back
+    sender.close(patience=0)
+
+
+def test_receiver_that_leaves_no_longer_holds_the_sender_back(hub, client, spool):
+    answers = Answers(hub)
+    answers.mood = MessageError(BUSY)
+    sender = Sender(client, spool, "a1", "b1", timeout=2.0)
+    sender.put(KEY, TaskQuery(cell=0))
+    wait_until(lambda: sender.held_back)
+    answers.server.close()
+    # what it makes meanwhile waits in the spool, as it does whenever nobody is there
+    wait_until(lambda: not sender.held_back)
+    assert len(spool) == 1
+    again = Answers(hub)
+    assert sender.close(patience=10) == 0
+    again.server.close()
+
+
+def test_final_refusal_behind_busy_ends_the_holding_back(hub, client, spool):
+    answers = Answers(hub)
+    answers.mood = MessageError(BUSY)
+    sender = Sender(client, spool, "a1", "b1")
+    sender.put(KEY, TaskQuery(cell=0))
+    wait_until(lambda: sender.held_back)
+    answers.mood = MessageError("contract differs in 'reward'")
+    wait_until(lambda: sender.refused)
+    wait_until(lambda: not sender.held_back)
+    assert sender.close(patience=5) == 0
+    answers.server.close()
 
 
 def test_refused_message_is_dropped_counted_and_does_not_hold_up_the_next(hub, client, spool):

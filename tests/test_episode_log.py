@@ -1,9 +1,12 @@
+import errno
 import json
 import logging
+import os
 import resource
+import shutil
 import signal
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,6 +28,32 @@ def opened(
 ) -> tuple[EpisodeLog, list[Record]]:
     log = EpisodeLog(folder, capacity, segment_bytes)
     return log, list(log.restore())
+
+
+class Syncs:
+    """os.fdatasync with its calls counted: (file, size) each. `fail` makes the next so many raise."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, int]] = []
+        self.fail = 0
+        self.before: Callable[[], None] = lambda: None
+        self._real = os.fdatasync
+
+    def __call__(self, descriptor: int) -> None:
+        self.before()
+        path = Path(f"/proc/self/fd/{descriptor}").resolve()
+        self.calls.append((path.name, os.fstat(descriptor).st_size))
+        if self.fail:
+            self.fail -= 1
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        self._real(descriptor)
+
+
+@pytest.fixture
+def syncs(monkeypatch) -> Syncs:
+    found = Syncs()
+    monkeypatch.setattr(os, "fdatasync", found)
+    return found
 
 
 def filled(folder: Path, count: int = 3) -> Path:
@@ -124,6 +153,90 @@ def test_flipped_bit_anywhere_in_a_record_is_noticed(tmp_path, caplog):
         log.close()
         assert [r.payload for r in records] == [b"episode 0", b"episode 1"], f"byte {position}"
         assert f"cut a torn tail of {len(whole) - start} bytes" in caplog.text
+
+
+def spans(folder: Path) -> tuple[bytes, int, int]:
+    """A log of five episodes, and where its third record begins and ends."""
+    whole = filled(folder / "whole", 5).read_bytes()
+    begin, end = (filled(folder / str(count), count).stat().st_size for count in (2, 3))
+    return whole, begin, end
+
+
+def assert_only_the_third_is_missing(folder: Path, caplog, skipped: int, where: str) -> None:
+    caplog.clear()
+    log, records = opened(folder)
+    log.close()
+    assert [r.origin.seq for r in records] == [0, 1, 3, 4], where
+    assert [r.payload for r in records] == [f"episode {seq}".encode() for seq in (0, 1, 3, 4)]
+    # the counts after each are those of the run, in which the lost episode did take place
+    assert [(r.env_steps, r.episodes) for r in records] == [(1, 1), (3, 2), (10, 4), (15, 5)]
+    assert (log.env_steps, log.episodes) == (15, 5)
+    assert [log.seen.seen(origin(seq)) for seq in range(6)] == [True, True, False, True, True, False]
+    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert warnings == [
+        f"{folder / '00000001.log'}: skipped {skipped} damaged bytes before a whole record"
+    ], where
+
+
+def test_flipped_bit_anywhere_in_the_middle_costs_only_the_record_it_hits(tmp_path, caplog):
+    whole, begin, end = spans(tmp_path)
+    for position in range(begin, end):
+        for bit in (0x01, 0x80):
+            data = bytearray(whole)
+            data[position] ^= bit
+            (tmp_path / "whole" / "00000001.log").write_bytes(data)
+            assert_only_the_third_is_missing(
+                tmp_path / "whole", caplog, end - begin, f"byte {position}, bit {bit}"
+            )
+    # reading changed nothing: the same file, repaired, is whole again
+    assert (tmp_path / "whole" / "00000001.log").stat().st_size == len(whole)
+
+
+@pytest.mark.parametrize("pattern", [b"\x00", b"\xff", b"NVQ1", b"NVQ1\x05\x00\x00\x00\x00\x00\x00\x00"])
+def test_overwritten_bytes_anywhere_in_the_middle_cost_only_the_record_they_hit(tmp_path, caplog, pattern):
+    whole, begin, end = spans(tmp_path)
+    for first in range(begin, end):
+        for last in {min(first + 4, end), min(first + 16, end), end}:
+            damage = (pattern * (last - first))[: last - first]
+            if damage == whole[first:last]:
+                continue
+            (tmp_path / "whole" / "00000001.log").write_bytes(whole[:first] + damage + whole[last:])
+            assert_only_the_third_is_missing(
+                tmp_path / "whole", caplog, end - begin, f"bytes {first} to {last}"
+            )
+
+
+def test_bytes_that_vanish_from_the_middle_cost_only_the_record_they_belonged_to(tmp_path, caplog):
+    whole, begin, end = spans(tmp_path)
+    for gone in range(begin, end):
+        (tmp_path / "whole" / "00000001.log").write_bytes(whole[:gone] + whole[gone + 1 :])
+        assert_only_the_third_is_missing(tmp_path / "whole", caplog, end - begin - 1, f"byte {gone}")
+
+
+def test_damage_over_the_border_of_two_records_costs_both_and_no_third(tmp_path, caplog):
+    whole, begin, end = spans(tmp_path)
+    segment = tmp_path / "whole" / "00000001.log"
+    segment.write_bytes(whole[: begin - 1] + b"xx" + whole[begin + 1 :])
+    log, records = opened(segment.parent)
+    log.close()
+    assert [r.origin.seq for r in records] == [0, 3, 4]
+    assert (log.env_steps, log.episodes) == (15, 5)
+    second = filled(tmp_path / "one", 1).stat().st_size
+    assert f"skipped {end - second} damaged bytes before a whole record" in caplog.text
+
+
+def test_appending_goes_on_behind_damage_in_the_middle(tmp_path):
+    whole, begin, _ = spans(tmp_path)
+    segment = tmp_path / "whole" / "00000001.log"
+    segment.write_bytes(whole[:begin] + b"oops" + whole[begin + 4 :])
+    log, _ = opened(segment.parent)
+    record = log.append(origin(5), 6, b"episode 5")
+    assert (record.env_steps, record.episodes) == (21, 6)
+    again = log.append(origin(2), 3, b"episode 2, which its sender still had")
+    assert (again.env_steps, again.episodes) == (24, 7)
+    log.close()
+    _, records = opened(segment.parent)
+    assert [r.origin.seq for r in records] == [0, 1, 3, 4, 5, 2]
 
 
 def test_file_of_zeros_after_the_last_record_is_cut(tmp_path):
@@ -238,3 +351,108 @@ def test_checksum_is_of_the_body(tmp_path):
     assert data[:4] == b"NVQ1"
     assert int.from_bytes(data[4:8], "little") == len(data) - 12
     assert int.from_bytes(data[8:12], "little") == zlib.crc32(data[12:])
+
+
+def synced(folder: Path, segment_bytes: int = 2**20) -> EpisodeLog:
+    """A log whose commits reach the disk, with nothing in it yet."""
+    log = EpisodeLog(folder, CAPACITY, segment_bytes, sync=True)
+    assert list(log.restore()) == []
+    return log
+
+
+def test_one_commit_brings_many_appends_to_the_disk_with_one_wait(tmp_path, syncs):
+    log = synced(tmp_path)
+    log.commit()
+    assert syncs.calls == [], "there was nothing to wait for"
+    for group in (range(0, 50), range(50, 51), range(51, 60)):
+        syncs.calls.clear()
+        for seq in group:
+            log.append(origin(seq), 1, bytes(100))
+        assert syncs.calls == [], "an append does not wait"
+        log.commit()
+        # of the right file, when all of it was written
+        assert syncs.calls == [("00000001.log", (tmp_path / "00000001.log").stat().st_size)]
+        log.commit()
+        assert len(syncs.calls) == 1, "what is on the disk is not waited for again"
+    log.close()
+    assert len(opened(tmp_path)[1]) == 60
+
+
+def test_a_segment_is_on_the_disk_before_the_next_one_begins(tmp_path, syncs):
+    log = synced(tmp_path, segment_bytes=300)
+    for seq in range(6):  # two episodes fill a segment
+        log.append(origin(seq), 1, bytes(150))
+    sizes = {path.name: path.stat().st_size for path in sorted(tmp_path.glob("*.log"))}
+    assert list(sizes) == ["00000001.log", "00000002.log", "00000003.log"]
+    assert syncs.calls == [(name, sizes[name]) for name in ("00000001.log", "00000002.log")]
+    log.commit()
+    assert syncs.calls[2:] == [("00000003.log", sizes["00000003.log"])]
+
+
+def test_without_sync_no_episode_waits_for_the_disk(tmp_path, syncs):
+    log, _ = opened(tmp_path, segment_bytes=300)
+    for seq in range(6):
+        log.append(origin(seq), 1, bytes(150))
+        log.commit()
+    log.close()
+    assert syncs.calls == []
+
+
+def test_names_of_new_segments_are_brought_to_the_disk_with_sync(tmp_path, monkeypatch):
+    folders, real = [], os.fsync
+
+    def fsync(descriptor: int) -> None:
+        folders.append(Path(f"/proc/self/fd/{descriptor}").resolve())
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    log = synced(tmp_path, segment_bytes=300)
+    for seq in range(6):
+        log.append(origin(seq), 1, bytes(150))
+    assert folders.count(tmp_path.resolve()) >= 3
+
+
+def test_commit_that_failed_never_says_later_that_all_is_well(tmp_path, syncs):
+    log = synced(tmp_path)
+    log.append(origin(0), 1, b"lost")
+    syncs.fail = 1
+    with pytest.raises(OSError, match="Input/output"):
+        log.commit()
+    # Linux tells of a failed write once: the next fdatasync of the file succeeds, with the data still lost
+    with pytest.raises(OSError):
+        log.commit()
+    with pytest.raises(OSError):
+        log.append(origin(1), 1, b"new")
+        log.commit()
+
+
+def test_rotation_whose_wait_for_the_disk_fails_makes_every_later_commit_fail(tmp_path, syncs):
+    log = synced(tmp_path, segment_bytes=1)
+    log.append(origin(0), 1, b"lost")
+    syncs.fail = 1
+    with pytest.raises(OSError, match="Input/output"):
+        log.append(origin(1), 1, b"next segment")
+    with pytest.raises(OSError):  # it would acknowledge what the disk has lost
+        log.commit()
+
+
+def test_duplicates_that_a_rotation_writes_down_are_on_the_disk_before(tmp_path, syncs):
+    log = synced(tmp_path / "log", segment_bytes=1)
+    copies: list[Path] = []
+
+    def lose_power() -> None:
+        """The folder as it is found when power fails now: without what was never waited for."""
+        copy = tmp_path / f"copy-{len(copies)}"
+        shutil.copytree(tmp_path / "log", copy)
+        os.truncate(copy / f"{len(copies) + 1:08d}.log", 0)
+        copies.append(copy)
+
+    syncs.before = lose_power
+    for seq in range(4):
+        log.append(origin(seq), 1, b"episode")
+    log.close()
+    assert len(copies) == 3
+    for seq, copy in enumerate(copies):
+        found, records = opened(copy)
+        assert [r.origin.seq for r in records] == list(range(seq))
+        assert not found.seen.seen(origin(seq)), "its sender, never told, would be told `duplicate`"

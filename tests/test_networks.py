@@ -3,7 +3,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch import nn
+import torch.nn.functional as F
+from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
@@ -12,7 +13,10 @@ from common.networks import (
     LOG_STD_MAX,
     LOG_STD_MIN,
     Encoder,
+    FusionNetwork,
     Normalizer,
+    ParallelLinear,
+    ParallelNorm,
     Perception,
     Policy,
     TwinCritic,
@@ -34,13 +38,57 @@ def policy_with(mean: list[float], log_std: list[float]) -> tuple[Policy, torch.
     policy = Policy(layout, config.network)
     squashed = [(x - LOG_STD_MIN) / (LOG_STD_MAX - LOG_STD_MIN) * 2 - 1 for x in log_std]
     with torch.no_grad():
-        policy.net.output.weight.zero_()
-        policy.net.output.bias.copy_(torch.tensor([*mean, *map(math.atanh, squashed)]))
+        policy.net.output.weights[0].zero_()
+        policy.net.output.bias[0, 0] = torch.tensor([*mean, *map(math.atanh, squashed)])
     return policy, torch.zeros(1, layout.size)
 
 
-def linear_sizes(module: nn.Module) -> list[tuple[int, int]]:
-    return [(m.in_features, m.out_features) for m in module.modules() if isinstance(m, nn.Linear)]
+def linear_sizes(module: nn.Module, members: int) -> list[tuple[tuple[int, ...], int]]:
+    """Inputs and outputs of every linear layer, each of which must have so many members."""
+    sizes = []
+    for layer in module.modules():
+        assert not isinstance(layer, nn.Linear)
+        if isinstance(layer, ParallelLinear):
+            shapes = [tuple(weight.shape) for weight in layer.weights]
+            outputs = layer.bias.shape[2]
+            assert layer.bias.shape == (members, 1, outputs)
+            assert all(shape == (members, shape[1], outputs) for shape in shapes)
+            sizes.append((tuple(shape[1] for shape in shapes), outputs))
+    return sizes
+
+
+def norms(*modules: nn.Module) -> list[ParallelNorm]:
+    """The normalisations of features; nn.LayerNorm is none of them."""
+    found = [m for module in modules for m in module.modules()]
+    assert not any(isinstance(m, nn.LayerNorm) for m in found)
+    return [m for m in found if isinstance(m, ParallelNorm)]
+
+
+def randomize(module: nn.Module, seed: int = 0) -> None:
+    """Gives every parameter, also those that begin as zeros or ones, values of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.3)
+
+
+def linear(layer: ParallelLinear, member: int, x: Tensor) -> Tensor:
+    """What one member does, on the concatenation of its inputs, by torch's own function."""
+    weight = torch.cat([part[member] for part in layer.weights])
+    return F.linear(x, weight.T, layer.bias[member, 0])
+
+
+def chain(layers: nn.Sequential, member: int, x: Tensor) -> Tensor:
+    """One member of layers in a row, by torch's own functions."""
+    for layer in layers:
+        if isinstance(layer, ParallelLinear):
+            x = linear(layer, member, x)
+        elif isinstance(layer, ParallelNorm):
+            x = F.layer_norm(x, x.shape[-1:], layer.weight[member, 0], layer.bias[member, 0])
+        else:
+            assert isinstance(layer, nn.ReLU)
+            x = x.clamp(min=0)
+    return x
 
 
 def test_paper_encoder_gives_5_by_5_by_32_features_for_a_stack_of_80_by_80():
@@ -215,26 +263,152 @@ def test_paper_networks_have_the_papers_branches_and_differ_in_the_output_layer_
     config = resolve("paper")
     layout = ObservationLayout.of(config)
     policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
-    assert linear_sizes(policy.net.lidar_branch) == [(256, 64), (64, 32)]
-    assert linear_sizes(policy.net.history_branch) == [(12, 8)]
-    assert linear_sizes(policy.net.head) == [(800 + 32 + 8, 256), (256, 256)]
-    assert linear_sizes(policy.net.output) == [(256, 4)]
-    assert len(critic.critics) == 2
-    for net in critic.critics:
-        assert linear_sizes(net.lidar_branch) == [(256, 64), (64, 32)]
-        assert linear_sizes(net.history_branch) == [(12, 8)]
-        assert linear_sizes(net.head) == [(800 + 32 + 8 + 2, 256), (256, 256)]
-        assert linear_sizes(net.output) == [(256, 1)]
-    assert not any(isinstance(m, nn.LayerNorm) for m in (*policy.modules(), *critic.modules()))
+    for net, members in ((policy.net, 1), (critic.net, 2)):
+        assert linear_sizes(net.lidar_branch, members) == [((256,), 64), ((64,), 32)]
+        assert linear_sizes(net.history_branch, members) == [((12,), 8)]
+        assert linear_sizes(net.head, members) == [((256,), 256)]
+    assert linear_sizes(policy.net.fusion, 1) == [((800, 32, 8), 256)]
+    assert linear_sizes(critic.net.fusion, 2) == [((800, 32, 8, 2), 256)]
+    assert linear_sizes(policy.net.output, 1) == [((256,), 4)]
+    assert linear_sizes(critic.net.output, 2) == [((256,), 1)]
+    for module, members in ((policy, 1), (critic, 2)):
+        assert len(linear_sizes(module, members)) == 6
+    assert norms(policy, critic) == []
 
 
 def test_fast_networks_pass_lidar_and_history_through_and_normalise_the_critics():
     config = resolve("fast")
     layout = ObservationLayout.of(config)
     policy, critic = Policy(layout, config.network), TwinCritic(layout, config.network)
-    assert linear_sizes(policy.net)[0][0] == layout.size == layout.visual + 256 + 12
-    assert not any(isinstance(m, nn.LayerNorm) for m in policy.modules())
-    assert sum(isinstance(m, nn.LayerNorm) for m in critic.modules()) == 4
+    assert layout.size == layout.visual + 256 + 12
+    assert linear_sizes(policy, 1) == [((layout.size,), 256), ((256,), 256), ((256,), 4)]
+    assert linear_sizes(critic, 2) == [((layout.size, 2), 256), ((256,), 256), ((256,), 1)]
+    assert norms(policy) == []
+    assert [tuple(norm.weight.shape) for norm in norms(critic)] == [(2, 1, 256), (2, 1, 256)]
+
+
+@pytest.mark.parametrize("members", [1, 2, 3])
+@pytest.mark.parametrize("inputs", [(5,), (4, 3), (6, 1, 2)])
+def test_parallel_layer_equals_linear_layers_of_the_concatenated_input(members, inputs):
+    generator = torch.Generator().manual_seed(members)
+    layer = ParallelLinear(members, inputs, 7).double()
+    parts = [torch.randn(9, size, generator=generator, dtype=torch.float64) for size in inputs]
+    apart = [torch.randn(members, 9, n, generator=generator, dtype=torch.float64) for n in inputs]
+    mixed = [apart[0], *parts[1:]]
+    for given in (parts, apart, mixed):
+        found = layer(*given)
+        assert found.shape == (members, 9, 7)
+        for member in range(members):
+            own = [x if x.dim() == 2 else x[member] for x in given]
+            expected = linear(layer, member, torch.cat(own, dim=1))
+            torch.testing.assert_close(found[member], expected, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_gradients_of_a_parallel_layer_are_those_of_its_linear_layers(shared):
+    layer = ParallelLinear(2, (4, 3), 5).double()
+    torch.manual_seed(0)
+    given = [torch.randn(6, 4).double(), torch.randn(*(() if shared else (2,)), 6, 3).double()]
+    given = [x.requires_grad_() for x in given]
+    factors = torch.randn(2, 6, 5).double()
+    wanted = [*given, *layer.parameters()]
+    ours = torch.autograd.grad((layer(*given) * factors).sum(), wanted)
+    plain = torch.stack(
+        [linear(layer, m, torch.cat([x if x.dim() == 2 else x[m] for x in given], dim=1)) for m in range(2)]
+    )
+    theirs = torch.autograd.grad((plain * factors).sum(), wanted)
+    for a, b in zip(ours, theirs, strict=True):
+        assert a.abs().min() > 0
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_parallel_layer_takes_as_many_inputs_as_it_was_made_for():
+    layer = ParallelLinear(1, (4, 3), 5)
+    with pytest.raises(ValueError, match=r"zip\(\) argument"):
+        layer(torch.zeros(6, 4))
+
+
+@pytest.mark.parametrize("inputs", [(400,), (300, 100)])
+def test_parallel_layer_begins_as_a_linear_layer_of_the_whole_input(inputs):
+    torch.manual_seed(0)
+    layer, plain = ParallelLinear(2, inputs, 500), nn.Linear(400, 500)
+    for parameter in layer.weights:
+        assert parameter.abs().max() <= 0.05  # 400^-1/2
+        assert parameter.std().item() == pytest.approx(plain.weight.std().item(), rel=0.02)
+        assert not torch.equal(parameter[0], parameter[1])
+    assert layer.bias.abs().max() <= 0.05
+    assert layer.bias.std().item() == pytest.approx(plain.bias.std().item(), rel=0.1)
+
+
+@pytest.mark.parametrize("members", [1, 2])
+def test_parallel_norm_equals_a_layer_norm_per_member(members):
+    torch.manual_seed(0)
+    norm = ParallelNorm(members, 6).double()
+    plain = [nn.LayerNorm(6).double() for _ in range(members)]
+    x = 3 * torch.randn(members, 8, 6).double() + 2
+    x[0, 0] = 1e-3 * x[0, 0]  # here the variance is not far from the epsilon
+    x.requires_grad_()
+    for trained in (False, True):
+        if trained:
+            randomize(norm)
+            for member, layer in enumerate(plain):
+                layer.weight.data.copy_(norm.weight[member, 0])
+                layer.bias.data.copy_(norm.bias[member, 0])
+        factors = torch.randn(members, 8, 6).double()
+        ours, theirs = norm(x), torch.stack([layer(x[m]) for m, layer in enumerate(plain)])
+        torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+        a = torch.autograd.grad((ours * factors).sum(), [x, norm.weight, norm.bias])
+        b = torch.autograd.grad(
+            (theirs * factors).sum(), [x, *(p for layer in plain for p in layer.parameters())]
+        )
+        torch.testing.assert_close(a[0], b[0], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(a[1][:, 0], torch.stack(b[1::2]), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(a[2][:, 0], torch.stack(b[2::2]), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("hidden", [(11,), (11, 9), (11, 9, 8)])
+@pytest.mark.parametrize(("lidar", "history"), [((), ()), ((6, 5), (3,)), ((6,), ()), ((), (3,))])
+def test_networks_side_by_side_equal_plain_ones(layer_norm, hidden, lidar, history):
+    branches = (f"network.lidar_branch={list(lidar)}", f"network.history_branch={list(history)}")
+    config = resolve("smoke", overrides=(*branches, f"network.hidden={list(hidden)}"))
+    layout = ObservationLayout.of(config)
+    net = FusionNetwork(layout, config.network, 2, (2,), 3, layer_norm).double()
+    randomize(net)
+    assert len(norms(net)) == (len(hidden) if layer_norm else 0), "none in the branches"
+    generator = torch.Generator().manual_seed(1)
+    flat = torch.rand(10, layout.size, generator=generator, dtype=torch.float64)
+    action = torch.rand(10, 2, generator=generator, dtype=torch.float64)
+    before = flat.clone(), action.clone()
+    found = net(flat, action)
+    assert found.shape == (2, 10, 3)
+    visual, scans, past = flat.split([layout.visual, layout.lidar, layout.history], dim=1)
+    for m in range(2):
+        parts = [visual, chain(net.lidar_branch, m, scans), chain(net.history_branch, m, past), action]
+        if not lidar:
+            assert torch.equal(parts[1], scans)
+        if not history:
+            assert torch.equal(parts[2], past)
+        fused = linear(net.fusion, m, torch.cat(parts, dim=1))
+        expected = linear(net.output, m, chain(net.head, m, fused))
+        torch.testing.assert_close(found[m], expected, rtol=1e-12, atol=1e-12)
+        assert expected.std() > 0.01
+    assert torch.equal(flat, before[0])
+    assert torch.equal(action, before[1])
+
+
+def test_twin_critics_share_no_parameter():
+    config = resolve("paper")
+    layout = ObservationLayout.of(config)
+    critic = TwinCritic(layout, config.network)
+    twins = critic(torch.rand(3, layout.size), torch.ones(3, 2))
+    for member in range(2):
+        critic.zero_grad()
+        twins[member].sum().backward(retain_graph=True)
+        for name, parameter in critic.named_parameters():
+            assert parameter.grad is not None
+            assert parameter.grad[member].abs().sum() > 0, name
+            assert parameter.grad[1 - member].abs().sum() == 0, name
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -331,7 +505,7 @@ def test_log_standard_deviation_stays_within_its_limits():
     layout = ObservationLayout.of(config)
     policy = Policy(layout, config.network)
     with torch.no_grad():
-        policy.net.output.bias[2:] = torch.tensor([1e6, -1e6])
+        policy.net.output.bias[0, 0, 2:] = torch.tensor([1e6, -1e6])
     _, log_std = policy(torch.zeros(1, layout.size))
     assert log_std[0].tolist() == pytest.approx([2.0, -5.0])
 
@@ -358,8 +532,8 @@ def test_state_is_loaded_back_under_its_names():
     source, target = Policy(layout, config.network), Policy(layout, config.network)
     critic = TwinCritic(layout, config.network)
     state = state_of(policy=source, critic=critic)
-    assert "policy.net.output.weight" in state
-    assert "critic.critics.1.output.bias" in state
+    assert state["policy.net.output.weights.0"].shape == (1, 32, 4)
+    assert state["critic.net.output.bias"].shape == (2, 1, 1)
     flat = torch.rand(3, layout.size)
     assert not torch.equal(source.mode(flat), target.mode(flat))
     load_state(state, policy=target)

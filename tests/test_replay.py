@@ -36,6 +36,11 @@ def number_of(batch: Batch) -> list[int]:
     return np.rint(batch.action[:, 0] * 4096).astype(int).tolist()  # minus 1, so that no row is 0
 
 
+def add(replay: Replay, episode: Episode) -> None:
+    """Adds an episode that follows the newest one in the run."""
+    replay.add(episode, int(replay._step.max()) + 1)
+
+
 def draw(replay: Replay, size: int = 4096, n_step: int = 1, importance: float = 0.5) -> Batch:
     return replay.sample(size, n_step, 0.5, importance)
 
@@ -81,7 +86,7 @@ def check_consistent(replay: Replay, kept: list[Episode]) -> None:
 
 def test_probability_is_the_priority_to_the_power_c_and_weights_are_those_of_the_paper():
     replay = make_replay("replay.priority_exponent=0.5")
-    replay.add(numbered(4))
+    add(replay, numbered(4))
     replay.update_priorities(once_each(replay), np.array([1.0, -4.0, 9.0, 16.0]))
     # p^c = 1, 2, 3, 4
     assert shares(replay) == pytest.approx({1: 0.1, 2: 0.2, 3: 0.3, 4: 0.4}, abs=2e-4)
@@ -95,7 +100,7 @@ def test_probability_is_the_priority_to_the_power_c_and_weights_are_those_of_the
 
 def test_importance_weights_are_relative_to_the_largest_of_the_batch():
     replay = make_replay()
-    replay.add(numbered(2))
+    add(replay, numbered(2))
     replay.update_priorities(once_each(replay), np.array([1.0, 99.0]))
     for _ in range(20):
         batch = draw(replay, size=2, importance=1.0)
@@ -108,18 +113,18 @@ def test_importance_weights_are_relative_to_the_largest_of_the_batch():
 
 def test_new_episode_gets_the_highest_current_priority():
     replay = make_replay()
-    replay.add(numbered(3))
+    add(replay, numbered(3))
     assert shares(replay) == pytest.approx({1: 1 / 3, 2: 1 / 3, 3: 1 / 3}, abs=2e-4)
     replay.update_priorities(once_each(replay), np.array([0.9, 0.2, 0.1]))
     replay.update_priorities(once_each(replay), np.array([0.1, 0.4, 0.1]))  # 0.9 is history now
-    replay.add(numbered(2, first=10))
+    add(replay, numbered(2, first=10))
     expected = {1: 0.1 / 1.4, 2: 0.4 / 1.4, 3: 0.1 / 1.4, 11: 0.4 / 1.4, 12: 0.4 / 1.4}
     assert shares(replay) == pytest.approx(expected, abs=2e-4)
 
 
 def test_error_of_zero_keeps_a_transition_in_play():
     replay = make_replay("replay.priority_exponent=0.6")
-    replay.add(numbered(3))
+    add(replay, numbered(3))
     replay.update_priorities(once_each(replay), np.zeros(3))
     assert set(number_of(draw(replay, 100))) == {1, 2, 3}
     assert replay.highest_priority == pytest.approx(1e-6**0.6)
@@ -136,7 +141,7 @@ def test_error_of_zero_keeps_a_transition_in_play():
 )
 def test_three_step_returns_stop_at_the_end_and_bootstrap_unless_the_episode_terminated(ending, discounts):
     replay = make_replay()
-    replay.add(numbered(5, ending=ending))
+    add(replay, numbered(5, ending=ending))
     batch = once_each(replay, n_step=3)  # gamma is 0.5, the rewards are 1 to 5
     assert batch.reward.tolist() == [2.75, 4.5, 6.25, 6.5, 5.0]
     assert batch.discount.tolist() == discounts
@@ -145,7 +150,7 @@ def test_three_step_returns_stop_at_the_end_and_bootstrap_unless_the_episode_ter
 
 def test_one_step_returns_are_the_rewards():
     replay = make_replay()
-    replay.add(numbered(3, ending="success"))
+    add(replay, numbered(3, ending="success"))
     batch = once_each(replay)
     assert batch.reward.tolist() == [1, 2, 3]
     assert batch.discount.tolist() == [0.5, 0.5, 0.0]
@@ -154,8 +159,8 @@ def test_one_step_returns_are_the_rewards():
 
 def test_n_step_returns_never_reach_into_the_following_episode():
     replay = make_replay()
-    replay.add(numbered(2))
-    replay.add(numbered(6, first=100))
+    add(replay, numbered(2))
+    add(replay, numbered(6, first=100))
     batch = once_each(replay, n_step=5)
     assert batch.reward[:2].tolist() == [2.0, 2.0]
     assert batch.next_observation.visual[:2, -1, 0].tolist() == [2, 2]
@@ -166,7 +171,7 @@ def test_sampled_observations_are_those_the_agent_saw(n_step):
     replay = make_replay()
     episodes = [numbered(steps, first) for steps, first in ((9, 0), (1, 100), (5, 200))]
     for episode in episodes:
-        replay.add(episode)
+        add(replay, episode)
     batch = draw(replay, 300, n_step)
     for i, number in enumerate(number_of(batch)):
         episode, t = episodes[number // 100], number % 100 - 1
@@ -181,7 +186,7 @@ def test_sampled_observations_are_those_the_agent_saw(n_step):
 
 def test_observation_never_contains_the_action_it_leads_to_and_the_next_one_does():
     replay = make_replay()
-    replay.add(numbered(20))
+    add(replay, numbered(20))
     batch = draw(replay, 500)
     for i in range(500):
         assert batch.action[i, 0] not in batch.observation.history[i, :8]
@@ -191,7 +196,7 @@ def test_observation_never_contains_the_action_it_leads_to_and_the_next_one_does
 def test_last_row_is_never_sampled():
     replay = make_replay()
     for first in range(0, 30, 10):
-        replay.add(numbered(3, first))
+        add(replay, numbered(3, first))
     batch = draw(replay)
     assert set(number_of(batch)) == {1, 2, 3, 11, 12, 13, 21, 22, 23}
     assert set(batch.observation.visual[:, -1, 0].tolist()) == {0, 1, 2, 10, 11, 12, 20, 21, 22}
@@ -199,8 +204,8 @@ def test_last_row_is_never_sampled():
 
 def test_samples_are_stratified():
     replay = make_replay()
-    replay.add(numbered(20))
-    replay.add(numbered(12, first=100))
+    add(replay, numbered(20))
+    add(replay, numbered(12, first=100))
     for _ in range(20):
         numbers = number_of(draw(replay, 32))
         assert numbers == [*range(1, 21), *range(101, 113)]
@@ -210,7 +215,7 @@ def test_samples_follow_the_generator():
     batches = []
     for seed in (3, 3, 4):
         replay = make_replay(seed=seed)
-        replay.add(numbered(20))
+        add(replay, numbered(20))
         batches.append(number_of(draw(replay, 7)))
     assert batches[0] == batches[1] != batches[2]
 
@@ -219,20 +224,20 @@ def test_oldest_episode_is_dropped_as_a_whole_and_only_for_room():
     replay = make_replay()
     episodes = [numbered(10, first) for first in range(0, 500, 100)]
     for episode in episodes[:4]:
-        replay.add(episode)
+        add(replay, episode)
     check_consistent(replay, episodes[:4])
     assert replay.transitions == 40
-    replay.add(numbered(1, 900))
+    add(replay, numbered(1, 900))
     assert replay.transitions == 31
     assert set(number_of(draw(replay))) == {n + t for n in (100, 200, 300) for t in range(1, 11)} | {901}
 
 
 def test_late_priority_for_an_overwritten_transition_changes_nothing():
     replay = make_replay()
-    replay.add(numbered(20))
+    add(replay, numbered(20))
     late = once_each(replay)
     for first in range(100, 500, 100):  # the fourth begins at the first row again
-        replay.add(numbered(15, first))
+        add(replay, numbered(15, first))
     assert replay._tree.weights[late.rows].max() > 0, "the rows were to be in use again"
     before = replay._tree.weights.copy()
     replay.update_priorities(late, np.full(20, 1e3))
@@ -241,10 +246,10 @@ def test_late_priority_for_an_overwritten_transition_changes_nothing():
 
 def test_priorities_are_written_for_what_is_left_of_a_batch():
     replay = make_replay()
-    replay.add(numbered(20))
-    replay.add(numbered(20, first=100))
+    add(replay, numbered(20))
+    add(replay, numbered(20, first=100))
     batch = once_each(replay)
-    replay.add(numbered(1, first=200))
+    add(replay, numbered(1, first=200))
     replay.update_priorities(batch, np.where(np.array(number_of(batch)) == 105, 3.0, 0.0))
     assert replay._tree.total == pytest.approx(3 + 1, abs=1e-3)  # of 105 and of the new one
 
@@ -268,7 +273,7 @@ def test_thousands_of_episodes_of_any_length_leave_the_buffer_consistent(name, l
         episode = of_length[lengths(rng)]
         marked = np.full_like(episode.lidar, i)  # exact in float16
         added.append(episode.model_copy(update={"lidar": marked}))
-        replay.add(added[-1])
+        add(replay, added[-1])
         kept = added[-len(replay._episodes) :]
         assert replay.transitions <= 60
         fullest = max(fullest, replay.transitions)
@@ -288,7 +293,9 @@ def test_bytes_needed_are_the_bytes_of_all_arrays(end_to_end):
     layout = ObservationLayout.of(config)
     replay = Replay(config.replay, layout, 20, np.random.default_rng(0))
     arrays = [value for value in vars(replay).values() if isinstance(value, np.ndarray | Columns)]
-    total = sum(array.nbytes for array in arrays) + replay._tree._nodes.nbytes
+    total = sum(array.nbytes for array in arrays) + sum(
+        v.nbytes for v in vars(replay._tree).values() if isinstance(v, np.ndarray)
+    )
     assert Replay.bytes_needed(config.replay, layout, 20) == total
 
 
@@ -297,7 +304,7 @@ def test_frames_are_kept_as_bytes_end_to_end():
     layout = ObservationLayout.of(config)
     replay = Replay(config.replay, layout, 20, np.random.default_rng(0))
     episode = tiny_episode(config, 3)
-    replay.add(episode)
+    add(replay, episode)
     batch = replay.sample(3, 1, 0.9, 0.4)
     assert batch.observation.visual.dtype == np.uint8
     assert batch.observation.visual.shape == (3, 4, 16, 16, 3)
@@ -309,3 +316,32 @@ def test_capacity_for_less_than_two_episodes_is_a_usage_error():
     make_replay("replay.capacity=40")
     with pytest.raises(UsageError, match=r"replay\.capacity = 39 holds no two episodes of 20 steps"):
         make_replay("replay.capacity=39")
+
+
+def test_priorities_are_found_again_in_a_buffer_rebuilt_elsewhere_and_newer_transitions_get_the_highest():
+    replay, episodes = make_replay(), [numbered(5, first) for first in (0, 100, 200)]
+    for episode in episodes:
+        add(replay, episode)
+    replay.update_priorities(once_each(replay), np.arange(1.0, 16.0))
+    steps, weights = replay.priorities()
+    assert sorted(steps) == list(range(15))
+    rebuilt = make_replay()
+    for i, episode in ((1, episodes[1]), (2, episodes[2]), (3, numbered(4, 300))):  # 0 has been dropped
+        rebuilt.add(episode, 5 * i)
+    rebuilt.load_priorities(steps, weights)
+    assert [len(part) for part in rebuilt.priorities()] == [14, 14]
+    found = dict(zip(*(part.tolist() for part in rebuilt.priorities()), strict=True))
+    expected = {step: step + 1.0 for step in range(5, 15)} | dict.fromkeys(range(15, 19), 15.0)
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert rebuilt.highest_priority == pytest.approx(15.0, abs=1e-5)
+
+
+def test_priorities_that_do_not_fit_are_refused():
+    replay = make_replay()
+    add(replay, numbered(3))
+    with pytest.raises(ValueError, match=r"priorities of shape \(2,\) for steps of shape \(3,\)"):
+        replay.load_priorities(np.arange(3), np.ones(2))
+    with pytest.raises(ValueError, match="finite and not negative"):
+        replay.load_priorities(np.arange(3), np.array([1.0, np.nan, 1.0]))
+    replay.load_priorities(np.zeros(0, np.int64), np.zeros(0))
+    assert replay._tree.total == 3.0

@@ -40,7 +40,7 @@ def make_batch(config: Config, size: int = 8, seed: int = 0, **fixed: float) -> 
         action=columns.action[:size],
         next_observation=observe(columns, rows[size:], np.zeros(size, np.int64), layout),
         rows=rows[:size],
-        written=rows[:size],
+        steps=rows[:size],
         **{name: value.astype(np.float32) for name, value in drawn.items()},
     )
 
@@ -80,6 +80,16 @@ def test_critic_loss_of_a_worked_case():
     loss = critic_loss(q, torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.5]))
     # twin 1: (.5 + .25) / 2, twin 2: (4.5 + 2.25) / 2
     assert loss.item() == pytest.approx(0.375 + 3.375)
+
+
+def test_huber_loss_of_a_worked_case():
+    q = torch.tensor([[1.0, 2.5], [-3.0, 0.5]], requires_grad=True)
+    loss = critic_loss(q, torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.5]), "huber")
+    # twin 1: (.5 + .5 * 1) / 2, twin 2: (2.5 + .5 * .125) / 2
+    assert loss.item() == pytest.approx(0.5 + 1.28125)
+    loss.backward()
+    assert q.grad is not None
+    assert q.grad.tolist() == [[0.5, 0.25], [-0.5, -0.125]], "beyond 1 the error pulls no harder"
 
 
 def test_policy_loss_of_a_worked_case():
@@ -172,6 +182,56 @@ def test_policy_step_leaves_no_gradient_in_the_critic_and_moves_only_the_policy(
     assert same(critic, values_of(sac.critic))
     assert not same(before, values_of(sac.policy))
     assert all(parameter.requires_grad for parameter in sac.critic.parameters())
+
+
+@pytest.mark.parametrize("end_to_end", [False, True])
+def test_policy_and_temperature_learn_from_the_observations_they_are_given_in_place_of_the_batch(end_to_end):
+    config = small_config("sac.policy_delay=1", f"encoder.end_to_end={str(end_to_end).lower()}")
+    batch, other = make_batch(config, weight=0.0), make_batch(config, seed=1)
+    given, swapped, plain = (SAC(config) for _ in range(3))
+    a, errors_a = given.update(batch, other.observation)
+    b, _ = swapped.update(other._replace(weight=batch.weight))
+    c, errors_c = plain.update(batch)
+    assert errors_a.tolist() == errors_c.tolist()
+    assert same(values_of(given.policy), values_of(swapped.policy))
+    assert not same(values_of(given.policy), values_of(plain.policy))
+    assert (a.policy, a.entropy, a.alpha) == (b.policy, b.entropy, b.alpha)
+    assert (a.policy, a.entropy) != (c.policy, c.entropy)
+    assert (a.critic, a.q) == (c.critic, c.q)
+    assert same(values_of(given.perception), values_of(SAC(config).perception)), "weights of 0 teach nothing"
+
+
+def test_critics_learn_from_their_batch_whatever_the_policy_learns_from():
+    config = small_config("sac.policy_delay=1")
+    batch, other = make_batch(config), make_batch(config, seed=1)
+    given, plain = SAC(config), SAC(config)
+    given.update(batch, other.observation)
+    plain.update(batch)
+    assert same(values_of(given.critic), values_of(plain.critic))
+    assert not same(values_of(given.critic), values_of(SAC(config).critic))
+
+
+def test_policy_is_due_before_the_updates_that_move_it():
+    config = small_config("sac.policy_delay=3")
+    sac = SAC(config)
+    due, moved = [], []
+    for seed in range(7):
+        due.append(sac.policy_due)
+        before = values_of(sac.policy)
+        sac.update(make_batch(config, seed=seed))
+        moved.append(not same(before, values_of(sac.policy)))
+    assert due == moved == [True, False, False, True, False, False, True]
+
+
+def test_critic_loss_is_the_one_that_is_configured():
+    squared, huber = (small_config(f"sac.critic_loss={kind}") for kind in ("squared", "huber"))
+    batch = make_batch(squared, reward=4.0, discount=0.0)
+    a, errors_a = SAC(squared).update(batch)
+    b, errors_b = SAC(huber).update(batch)
+    assert errors_a.tolist() == errors_b.tolist(), "priorities are of errors, not of losses"
+    assert errors_a.min() > 1
+    assert b.critic == pytest.approx((batch.weight * (2 * errors_a - 1)).mean(), rel=1e-4)
+    assert b.critic < 0.7 * a.critic
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.05])
@@ -321,18 +381,18 @@ def test_learner_starts_from_its_seed_and_leaves_the_global_generator_alone():
     states = [whole_state(SAC(small_config().model_copy(update={"seed": seed}))) for seed in (1, 1, 2)]
     assert torch.equal(torch.random.get_rng_state(), before)
     assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
-    key = "policy.net.head.0.weight"
+    key = "policy.net.fusion.weights.0"
     assert not torch.equal(states[0][key], states[2][key])
 
 
 def test_state_of_another_architecture_is_refused_naming_the_tensor():
     wider = SAC(small_config("network.hidden=[24, 16]"))
     state = wider.state()
-    with pytest.raises(ValueError, match=r"tensor policy\.net\.head\.0\.weight is of shape \(24, 32\)"):
+    with pytest.raises(ValueError, match=r"tensor policy\.net\.fusion\.bias is of shape \(1, 1, 24\)"):
         SAC(small_config()).load(*state, 0)
     networks, moments = SAC(small_config()).state()
-    del networks["target.critics.1.output.bias"]
-    with pytest.raises(ValueError, match=r"tensor target\.critics\.1\.output\.bias is missing"):
+    del networks["target.net.output.bias"]
+    with pytest.raises(ValueError, match=r"tensor target\.net\.output\.bias is missing"):
         SAC(small_config()).load(networks, moments, 0)
 
 
@@ -377,6 +437,24 @@ def test_td_target_end_to_end_sees_codes_of_the_target_encoder_and_the_policy_th
     np.testing.assert_allclose(errors, np.abs(q - batch.reward - batch.discount * soft).mean(0), rtol=1e-4)
 
 
+def test_weights_alone_leave_temperature_optimisers_and_count_as_they_were():
+    config = small_config(NORMALIZED, "sac.policy_delay=1", "sac.learning_rate=0.01")
+    source, fresh = SAC(config), SAC(config.model_copy(update={"seed": 8}))
+    for seed in range(3):
+        source.update(make_batch(config, seed=seed))
+    fresh.load_weights(source.state()[0])
+    for name in ("perception", "policy", "critic", "target"):
+        ours, theirs = getattr(fresh, name).state_dict(), getattr(source, name).state_dict()
+        assert all(torch.equal(value, theirs[key]) for key, value in ours.items()), name
+    assert fresh.alpha.item() == pytest.approx(config.sac.initial_alpha)
+    assert source.alpha.item() != fresh.alpha.item()
+    assert fresh.updates == 0
+    assert set(fresh.state()[1]) == {"generator"}
+    before = whole_state(source)
+    fresh.update(make_batch(config, seed=9))
+    assert all(torch.equal(value, before[key]) for key, value in whole_state(source).items())
+
+
 @pytest.mark.parametrize(("algorithm", "source"), [("navacl-q", "target"), ("navacl-q+", "critic")])
 def test_curriculum_gets_the_target_critics_to_the_letter_and_else_the_current_ones(algorithm, source):
     config = small_config(f"curriculum.algorithm='{algorithm}'")
@@ -414,4 +492,6 @@ def test_preset_updates_with_finite_figures_at_full_size(preset):
     assert losses.alpha == pytest.approx(config.sac.initial_alpha, rel=0.01)
     after = whole_state(sac)
     assert all(torch.isfinite(value.float()).all() for value in after.values())
-    assert not torch.equal(before["critic.critics.0.head.0.weight"], after["critic.critics.0.head.0.weight"])
+    key = "critic.net.fusion.weights.0"
+    for twin in range(2):
+        assert not torch.equal(before[key][twin], after[key][twin])

@@ -8,7 +8,7 @@ import typer
 from typer.exceptions import TyperException
 
 from common.bus import NoAnswerError, RefusedError
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.messages import MessageError
 from deploy.cli import bench, config, curriculum, doctor, evaluate, pretrain, processes, train, world
 
@@ -38,7 +38,7 @@ def run() -> None:
     except UsageError as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)
-    except (NoAnswerError, RefusedError, MessageError) as error:
+    except (NoAnswerError, RefusedError, MessageError, RunError) as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(1)
     except KeyboardInterrupt:

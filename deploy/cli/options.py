@@ -35,6 +35,10 @@ ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file on 
 Settings = Annotated[
     list[str] | None, typer.Option("--set", help="section.key=value on top of all; may be repeated.")
 ]
+Source = Annotated[
+    Path | None,
+    typer.Option("--from", help="Begin a new run from the weights of this checkpoint, or of a run's newest."),
+]
 Seed = Annotated[
     int | None, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random (default 0).")
 ]

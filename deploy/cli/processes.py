@@ -34,6 +34,7 @@ def learner(
     config: options.ConfigFile = None,
     settings: options.Settings = None,
     seed: options.Seed = None,
+    source: options.Source = None,
     insecure: options.Insecure = False,
 ) -> None:
     """Run the learner: replay, SAC, weights. It listens; actors and curriculum connect to it."""
@@ -44,7 +45,7 @@ def learner(
     wanted = None
     if not (run / "run.json").exists() or any((preset, variant, config, settings, seed is not None)):
         wanted = options.configuration(preset, variant, config, settings, seed)
-    directory = RunDirectory(run, wanted)
+    directory = RunDirectory(run, wanted, source=source)
     start_logging()
     exit_on_signals()
     with open_hub(address) as session:

@@ -16,6 +16,7 @@ from common.config import parse, resolve
 from common.contract import fetch_contract
 from common.errors import UsageError
 from common.messages import ContractReply
+from common.resources import learner_threads
 from common.tasks import suite as suite_tasks
 from common.telemetry import exit_on_signals
 from deploy.cli import options
@@ -23,21 +24,19 @@ from deploy.cli.evaluate import run_tasks
 from deploy.launcher import Child, Supervisor, free_port
 from deploy.screen import Monitor, Screen
 
-SPARE_CORES = 1
-"""Cores left to the learner when the number of actors is not given."""
-
 
 def train(
     run: options.Run = Path("runs/default"),
     minutes: options.Minutes = 40.0,
     actors: Annotated[
-        int | None, typer.Option(min=1, max=256, help="Actor processes; default: cores less one.")
+        int | None, typer.Option(min=1, max=256, help="Actor processes; default: cores less the learner's.")
     ] = None,
     preset: options.Preset = None,
     variant: options.Variant = None,
     config: options.ConfigFile = None,
     settings: options.Settings = None,
     seed: options.Seed = None,
+    source: options.Source = None,
     evaluation: Annotated[
         str | None,
         typer.Option("--eval", help="Suite on which to compare untrained and trained policy afterwards."),
@@ -48,14 +47,18 @@ def train(
     as_json: options.Json = False,
 ) -> None:
     """Train: starts learner, curriculum and actors, shows their progress, stops them, sums up."""
-    if not (run / "run.json").exists() or any((preset, variant, config, settings, seed is not None)):
+    exists = (run / "run.json").exists()
+    if exists and source is not None:
+        raise UsageError(f"{run} exists; to begin from {source} choose another --run")
+    if not exists or any((preset, variant, config, settings, seed is not None)):
         options.configuration(preset, variant, config, settings, seed)
     if evaluation is not None:
         suite_tasks(evaluation, options.configuration(None, None, None, None, None))
-    count = actors or max(1, (os.cpu_count() or 2) - SPARE_CORES)
+    cores = os.cpu_count() or 2
+    count = actors or max(1, cores - learner_threads("auto", cores))
     asked = _arguments(preset, variant, config, settings, seed)
     exit_on_signals()
-    load = _supervise(run, minutes or 40.0, count, f"tcp/127.0.0.1:{port or free_port()}", asked)
+    load = _supervise(run, minutes or 40.0, count, f"tcp/127.0.0.1:{port or free_port()}", asked, source)
     result = _summary(run, load)
     if evaluation is not None:
         result["eval"] = _compare(run, evaluation, result["seed"])
@@ -74,13 +77,16 @@ def _arguments(
     return given + [text for setting in settings or () for text in ("--set", setting)]
 
 
-def _supervise(run: Path, minutes: float, count: int, address: str, asked: list[str]) -> float:
+def _supervise(
+    run: Path, minutes: float, count: int, address: str, asked: list[str], source: Path | None
+) -> float:
     """Runs the processes until the learner's time is over; returns the load average at the end."""
     clock = _Clock()
 
     def learner() -> list[str]:
         left = max(0.01, minutes - clock.total / 60)
-        return ["learner", "--run", str(run), "--listen", address, "--minutes", f"{left:.4f}", *asked]
+        begin = ["--from", str(source)] if source and not (run / "run.json").exists() else []
+        return ["learner", "--run", str(run), "--listen", address, "--minutes", f"{left:.4f}", *begin, *asked]
 
     screen: Screen | None = None
     early: list[str] = []

@@ -28,6 +28,8 @@ HOLD_OUT = 10
 """One drive in so many, by the seed of its task, is never trained on."""
 FIXED = ("world.", "pretraining.drive_steps", "pretraining.near_share", "curriculum.gate.ranges")
 """Settings that shape the frames: those of a folder never change."""
+MADE_BY = ("world", "pretraining", "curriculum")
+"""The sections of a configuration that they are in."""
 
 
 class FrameStore:
@@ -123,7 +125,7 @@ class FrameStore:
             if self.folder.exists() and any(path.suffix != ".part" for path in self.folder.iterdir()):
                 raise UsageError(f"{self.folder} is not empty and holds no frames; choose another --frames")
             return
-        found = differing_keys(self.config, load_config(self.folder), FIXED)
+        found = differing_keys(self.config, load_config(self.folder, MADE_BY), FIXED)
         if found:
             key, asked, has = found[0]
             raise UsageError(

@@ -20,7 +20,7 @@ from common.encoders import ENCODER, HEADS
 from common.errors import UsageError
 from common.frames import FrameTable, in_parts
 from common.networks import load_state, make_encoder, state_of
-from common.policy_files import CONFIG, load_tensors, save_folder
+from common.policy_files import CONFIG, finish_saving, load_tensors, save_folder
 from learner.optimizers import load_moments, moments_of
 from learner.pretraining.figure import reconstruction_figure
 from learner.pretraining.objectives import Batch, Losses, Pretraining, Sampler
@@ -176,6 +176,7 @@ class Trainer:
 
     def _restore(self) -> None:
         folder = self.folder / "checkpoint"
+        finish_saving(self.folder)
         if not folder.exists():
             return
         try:

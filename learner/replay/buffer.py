@@ -15,6 +15,7 @@ from common.observation import Columns, Observation, ObservationLayout, observe
 from learner.replay.sum_tree import SumTree
 
 PRIORITY_FLOOR = 1e-6
+NO_STEP = np.int64(-1)
 ROWS_PER_TRANSITION = 1.25
 """Rows kept per transition of capacity: an episode of T transitions has T + 1 rows."""
 
@@ -33,8 +34,8 @@ class Batch(NamedTuple):
     weight: NDArray[np.float32]
     """(B,) importance weights, largest 1."""
     rows: NDArray[np.int64]
-    written: NDArray[np.int64]
-    """Absolute step of each row when it was sampled: a late priority for an overwritten row is ignored."""
+    steps: NDArray[np.int64]
+    """The run's step that each row held when it was sampled: a late priority for another one is ignored."""
 
 
 class Replay:
@@ -61,28 +62,30 @@ class Replay:
         self._first = np.zeros(self._size, np.int64)
         self._last = np.zeros(self._size, np.int64)
         self._terminated = np.zeros(self._size, bool)
-        self._written = np.full(self._size, -1, np.int64)
+        self._step = np.full(self._size, NO_STEP)
+        """The run's step that a row holds."""
         self._tree = SumTree(self._size)
         self._episodes: deque[tuple[int, int]] = deque()
         """(first row, transitions) of each stored episode, oldest first."""
-        self._head = 0
-        self._clock = 0
+        self._head = self._used = 0
+        self._highest: float | None = None
         self.transitions = 0
 
     @staticmethod
     def bytes_needed(config: ReplayConfig, layout: ObservationLayout, max_steps: int) -> int:
         """Memory of a full buffer, for a word before it is filled."""
         rows = int(ROWS_PER_TRANSITION * config.capacity) + max_steps + 1
-        leaves = 2 << max(rows - 1, 1).bit_length()
-        return rows * (Columns.empty(1, layout).nbytes + 25) + 8 * leaves
+        return rows * (Columns.empty(1, layout).nbytes + 25) + SumTree.bytes_needed(rows)
 
     @property
     def highest_priority(self) -> float:
         """The highest current p^c, which new transitions get; 1 while the buffer is empty."""
-        return float(self._tree.weights.max()) or 1.0
+        if self._highest is None:
+            self._highest = float(self._tree.weights.max())
+        return self._highest or 1.0
 
-    def add(self, episode: Episode) -> None:
-        """Stores an episode at the highest current priority."""
+    def add(self, episode: Episode, first_step: int) -> None:
+        """Stores an episode, whose first transition is the run's `first_step`, at the highest priority."""
         rows = episode.length + 1
         priority = self.highest_priority
         if self._head + rows > self._size:  # an episode never wraps around the end
@@ -99,11 +102,11 @@ class Replay:
         span = slice(first, last + 1)
         self._first[span], self._last[span] = first, last
         self._terminated[span] = not episode.truncated
-        self._written[span] = np.arange(self._clock, self._clock + rows)
+        self._step[first:last] = np.arange(first_step, first_step + rows - 1)
         self._tree.set(np.arange(first, last), priority)  # the last row is never sampled
         self._episodes.append((first, episode.length))
-        self._clock += rows
         self._head = last + 1
+        self._used = max(self._used, self._head)
         self.transitions += episode.length
 
     def _overlaps(self, first: int, last: int) -> bool:
@@ -112,37 +115,70 @@ class Replay:
 
     def _drop_oldest(self) -> None:
         first, length = self._episodes.popleft()
-        self._tree.set(np.arange(first, first + length + 1), 0.0)
-        self._written[first : first + length + 1] = -1
+        self._tree.set(np.arange(first, first + length), 0.0)
+        self._step[first : first + length] = NO_STEP
+        self._highest = None
         self.transitions -= length
 
     def sample(self, size: int, n_step: int, gamma: float, importance: float) -> Batch:
         """A stratified batch; `importance` is the exponent b."""
         strata = (np.arange(size) + self._rng.random(size)) / size
-        rows = self._tree.find(strata * self._tree.total)
-        probability = self._tree.get(rows) / self._tree.total
-        weight = (self.transitions * probability) ** -importance
-        ahead = rows[:, None] + np.arange(n_step)
-        last = self._last[rows]
-        valid = ahead < last[:, None]
-        rewards = self.columns.reward[np.minimum(ahead, last[:, None])] * valid
-        powers = gamma ** np.arange(n_step)
+        total = self._tree.total
+        rows = self._tree.find(strata * total)
+        weight = (self.transitions / total * self._tree.get(rows)) ** -importance
+        first, last = self._first.take(rows), self._last.take(rows)
         following = np.minimum(rows + n_step, last)
-        ended = (following == last) & self._terminated[rows]
-        first = self._first[rows]
+        ended = (following == last) & self._terminated.take(rows)
+        ahead = rows[:, None] + np.arange(n_step)
+        rewards = self.columns.reward.take(np.minimum(ahead, last[:, None])) * (ahead < last[:, None])
+        powers = gamma ** np.arange(n_step + 1)
+        both = observe(
+            self.columns, np.concatenate([rows, following]), np.concatenate([first, first]), self._layout
+        )
         return Batch(
-            observation=observe(self.columns, rows, first, self._layout),
-            action=self.columns.action[rows],
-            reward=(rewards @ powers).astype(np.float32),
-            discount=np.where(ended, 0.0, gamma ** (following - rows)).astype(np.float32),
-            next_observation=observe(self.columns, following, first, self._layout),
+            observation=both.part(slice(size)),
+            action=self.columns.action.take(rows, axis=0),
+            reward=(rewards @ powers[:n_step]).astype(np.float32),
+            discount=np.where(ended, 0.0, powers.take(following - rows)).astype(np.float32),
+            next_observation=both.part(slice(size, None)),
             weight=(weight / weight.max()).astype(np.float32),
             rows=rows,
-            written=self._written[rows],
+            steps=self._step.take(rows),
         )
+
+    def sample_uniformly(self, size: int) -> Observation:
+        """Observations of transitions that are all equally likely, whatever their priorities."""
+        rows = np.zeros(0, np.int64)
+        while len(rows) < size:  # few of the rows that were ever used hold no transition
+            drawn = self._rng.integers(0, self._used, size)
+            rows = np.concatenate([rows, drawn[self._step[drawn] != NO_STEP]])
+        rows = rows[:size]
+        return observe(self.columns, rows, self._first[rows], self._layout)
 
     def update_priorities(self, batch: Batch, errors: NDArray[np.float64]) -> None:
         """Sets p = |error| + 1e-6 of the sampled rows that still hold what was sampled."""
-        current = self._written[batch.rows] == batch.written
+        current = self._step[batch.rows] == batch.steps
         priority = (np.abs(errors[current]) + PRIORITY_FLOOR) ** self.config.priority_exponent
         self._tree.set(batch.rows[current], priority)
+        self._highest = None
+
+    def priorities(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The run's steps that are stored, and their p^c, for a checkpoint."""
+        rows = np.flatnonzero(self._step != NO_STEP)
+        return self._step[rows], self._tree.get(rows)
+
+    def load_priorities(self, steps: NDArray[np.int64], weights: NDArray[np.float64]) -> None:
+        """Gives the stored transitions the p^c they had; those that came later get the highest of them.
+
+        Raises ValueError when the arrays do not belong together.
+        """
+        if steps.shape != weights.shape or steps.ndim != 1:
+            raise ValueError(f"priorities of shape {weights.shape} for steps of shape {steps.shape}")
+        if not len(steps):
+            return
+        order = np.argsort(steps)
+        rows = np.flatnonzero(self._step != NO_STEP)
+        place = np.searchsorted(steps[order], self._step[rows]).clip(max=len(steps) - 1)
+        known = steps[order][place] == self._step[rows]
+        self._tree.set(rows, np.where(known, weights[order][place], weights.max()))
+        self._highest = None

@@ -1,13 +1,20 @@
-"""A binary sum tree over numpy arrays: a whole batch is written, or descends, at once."""
+"""A sum tree over numpy arrays: a whole batch is written, or descends, at once."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+FAN = 16
+"""Children of a node. A step of numpy costs so much for being a step that three wide levels take half of the
+time of the twenty of a binary tree over 2^20 leaves to search, and a tenth to write; they draw the same."""
+
 
 class SumTree:
-    """Non-negative weights of `capacity` leaves with prefix sampling in O(log capacity) per batch.
+    """Non-negative weights of `capacity` leaves, sampled by prefix sums.
+
+    Leaves in nodes of 16, those in blocks of 16, and a row with the sum of every block. What a write costs
+    does not depend on the capacity; a batch of samples scans that row, 4,096 numbers at 2^20 leaves, once.
 
     >>> tree = SumTree(4)
     >>> tree.set(np.array([0, 2]), np.array([1.0, 3.0]))
@@ -16,45 +23,63 @@ class SumTree:
     """
 
     def __init__(self, capacity: int) -> None:
-        self._leaves = 1 << max(capacity - 1, 1).bit_length()
-        self._nodes = np.zeros(2 * self._leaves)
+        blocks = -(-capacity // FAN**2)
         self.capacity = capacity
+        self._leaves = np.zeros((blocks * FAN, FAN))
+        self._nodes = np.zeros((blocks, FAN))
+        self._blocks = np.zeros((1, blocks))
+
+    @staticmethod
+    def bytes_needed(capacity: int) -> int:
+        """Memory of a tree."""
+        return 8 * -(-capacity // FAN**2) * (1 + FAN + FAN**2)
 
     @property
     def total(self) -> float:
         """Sum of all weights."""
-        return float(self._nodes[1])
+        return float(self._blocks.sum())
 
     @property
     def weights(self) -> NDArray[np.float64]:
         """(capacity,) view of the leaves."""
-        return self._nodes[self._leaves : self._leaves + self.capacity]
+        return self._leaves.reshape(-1)[: self.capacity]
 
     def get(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
         """Weights of leaves, same shape as `indices`."""
-        found: NDArray[np.float64] = self._nodes[self._leaves + indices]
-        return found
+        return self._leaves.take(indices)
 
     def set(self, indices: NDArray[np.int64], weights: NDArray[np.float64] | float) -> None:
         """Writes leaves; of an index that stands twice the last weight counts. Raises ValueError below 0."""
-        if np.any(np.asarray(weights) < 0) or not np.all(np.isfinite(weights)):
+        weights = np.asarray(weights)
+        if weights.size and not (weights.min() >= 0 and weights.max() < np.inf):  # NaN is neither
             raise ValueError("weights must be finite and not negative")
-        nodes = self._leaves + np.asarray(indices)
-        self._nodes[nodes] = weights
-        while len(nodes) and nodes[0] > 1:
-            nodes = np.unique(nodes >> 1)
-            self._nodes[nodes] = self._nodes[2 * nodes] + self._nodes[2 * nodes + 1]
+        nodes = indices // FAN
+        blocks = nodes // FAN
+        self._leaves.reshape(-1)[indices] = weights
+        self._nodes.reshape(-1)[nodes] = self._leaves.take(nodes, axis=0).sum(axis=1)
+        self._blocks[0, blocks] = self._nodes.take(blocks, axis=0).sum(axis=1)
 
     def find(self, prefixes: NDArray[np.float64]) -> NDArray[np.int64]:
         """For each prefix in [0, total) the leaf i with sum(weights[:i]) <= prefix < sum(weights[:i + 1])."""
-        prefixes = np.array(prefixes, np.float64)
-        nodes = np.ones(len(prefixes), np.int64)
-        while nodes[0] < self._leaves:
-            nodes <<= 1
-            left = self._nodes[nodes]
-            # a rounded-up prefix must not end in an empty subtree
-            right = (prefixes >= left) & (self._nodes[nodes + 1] > 0)
-            prefixes -= np.where(right, left, 0.0)
-            nodes += right
-        found: NDArray[np.int64] = nodes - self._leaves
+        found, rest = _descend(self._blocks, np.zeros(1, np.int64), prefixes)
+        for level in (self._nodes, self._leaves):
+            found, rest = _descend(level, found, rest)
         return found
+
+
+def _descend(
+    level: NDArray[np.float64], nodes: NDArray[np.int64], rest: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The children of `nodes`, (B,) or one for all, that hold prefixes `rest` (B,), and what is left then.
+
+    All children stand in one row of running sums, so that a single search finds each prefix within its own
+    node. Rounding must not lead it out of there, or to a child without weight.
+    """
+    weights = level.take(nodes, axis=0).reshape(-1)
+    edges = weights.cumsum()
+    ends = edges[level.shape[1] - 1 :: level.shape[1]]
+    starts = np.concatenate([[0.0], ends[:-1]])
+    inside = np.minimum(np.maximum(starts + rest, starts), np.nextafter(ends, -1.0))
+    places = edges.searchsorted(inside, side="right")
+    before = np.arange(len(nodes)) * level.shape[1]
+    return nodes * level.shape[1] + places - before, inside - (edges.take(places) - weights.take(places))
