@@ -35,7 +35,7 @@ from common.messages import encode as encode_message
 from common.networks import Perception, Policy, compile_encoder, make_encoder, state_of
 from common.observation import ObservationLayout
 from common.tasks import Task, candidate_task, random_task
-from deploy.bench.report import Report
+from deploy.bench.report import Report, rss
 
 EPISODE = 22
 """Steps of an episode; an optimal one takes about so many, so resets weigh as in a trained actor."""
@@ -79,7 +79,7 @@ def bench_sim(
     for name in ("raw_calls", "environment", "encoder", "policy"):
         report.add(f"{name}_per_step", median(times[name]), "ms")
     report.add("reset", median(times["reset"]), "ms")
-    report.add(f"rss_with_{crew.worlds + 2}_worlds", _rss(), "MB")
+    report.add(f"rss_with_{crew.worlds + 2}_worlds", rss(), "MB")
     report.compare("env_over_raw", times["raw_calls"], times["environment"])
     report.compare("gymnasium_over_raw", times["raw_calls"], times["gymnasium"])
     report.compare("actor_over_limit", times["actor_limit"], times["actor"])
@@ -95,13 +95,13 @@ def bench_sim(
 
 def _soak(world: DockingWorld, crew: _Crew, config: Config, steps: int, rng: np.random.Generator) -> float:
     """MB by which memory grows over so many steps, half of them in a world that changes its cell."""
-    before, done = _rss(), 0
+    before, done = rss(), 0
     while done < steps:
         task = random_task(int(rng.integers(len(CELLS))), config, rng)
         alone = len(_drive(world, task, rng)[2])
         crew.time_steps(max(1, alone // crew.worlds), duties=True)
         done += 2 * alone
-    return _rss() - before
+    return rss() - before
 
 
 def _drive(world: DockingWorld, task: Task, rng: np.random.Generator) -> tuple[float, float, list[Driven]]:
@@ -252,10 +252,3 @@ def _time(call: Callable[[], object], times: int) -> float:
         call()
         taken.append(time.perf_counter() - began)
     return median(taken)
-
-
-def _rss() -> float:
-    """Memory of this process, MB."""
-    status = Path("/proc/self/status").read_text("ascii")
-    line = next(line for line in status.splitlines() if line.startswith("VmRSS"))
-    return int(line.split()[1]) / 1024

@@ -50,6 +50,44 @@ def encoder(
 
 
 @app.command()
+def learner(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; about 2 s each.")] = 20,
+    soak: Annotated[
+        int, typer.Option(min=0, help="Updates of small networks at the end to see how much memory grows.")
+    ] = 0,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+) -> None:
+    """SAC updates per second, batches of 256, against stable-baselines3 and the matrix products alone."""
+    alike = ["sac.batch_size=256", "sac.policy_delay=1", "sac.n_step=1", "network.layer_norm=false"]
+    resolved = options.configuration("fast", None, None, alike, seed)
+    from deploy.bench.learner import bench_learner
+
+    with options.progress("rounds", rounds) as done:
+        report = bench_learner(resolved, rounds, soak, done)
+    _print(report, as_json)
+
+
+@app.command()
+def replay(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; about 0.1 s each.")] = 100,
+    capacity: Annotated[
+        int, typer.Option(min=10_000, help="Transitions; rivals take 2.7 KB each, this one 0.7 KB.")
+    ] = 2**20,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+) -> None:
+    """Sampling, gathering and priorities of batches of 256, against cpprb and TorchRL."""
+    chosen = [f"replay.capacity={capacity}", "sac.batch_size=256", "sac.policy_delay=1"]
+    resolved = options.configuration("fast", None, None, chosen, seed)
+    from deploy.bench.replay import bench_replay
+
+    with options.progress("rounds", rounds) as done:
+        report = bench_replay(resolved, rounds, done)
+    _print(report, as_json)
+
+
+@app.command()
 def sim(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds; about 1.5 s each.")] = 40,
     soak: Annotated[

@@ -1,0 +1,78 @@
+"""`navaclq bench learner` and `replay`: rows, rivals and ratios; the figures themselves decide nothing."""
+
+import builtins
+import json
+
+import numpy as np
+import pytest
+
+from common.config import resolve
+from common.observation import ObservationLayout
+from deploy.bench import replay as bench
+from deploy.cli.main import run
+from learner.learner import Learner
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def navaclq(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr("sys.argv", ["navaclq", "bench", *map(str, arguments), "--json"])
+    with pytest.raises(SystemExit) as ended:
+        run()
+    assert ended.value.code == 0
+    found = json.loads(capsys.readouterr().out)
+    return found, {row["name"]: row["value"] for row in found["rows"]}
+
+
+def test_bench_replay_compares_a_full_buffer_with_the_rivals_that_are_installed(monkeypatch, capsys):
+    pytest.importorskip("cpprb")
+    found, rows = navaclq(monkeypatch, capsys, "replay", "--capacity", 10_000, "--rounds", 2)
+    assert rows["transitions"] == 10_000
+    assert rows["navaclq: cycle"] < rows["update: SAC update"]
+    assert rows["cpprb: cycle"] > 0
+    best = min(value for name, value in rows.items() if name in ("cpprb: cycle", "torchrl: cycle"))
+    assert found["ratios"]["over_best_peer"] == pytest.approx(best / rows["navaclq: cycle"], rel=1.0)
+    assert found["ratios"]["update_over_replay_cost"] > 1
+    assert len(found["skipped"]) == ("torchrl: cycle" not in rows)
+
+
+def test_bench_replay_says_which_rivals_are_not_installed(monkeypatch, capsys):
+    real = builtins.__import__
+
+    def without_rivals(name, *rest, **named):
+        if name.partition(".")[0] in ("cpprb", "tensordict", "torchrl"):
+            raise ImportError(f"No module named {name!r}")
+        return real(name, *rest, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without_rivals)
+    found, rows = navaclq(monkeypatch, capsys, "replay", "--capacity", 10_000, "--rounds", 1)
+    assert [line.partition(":")[0] for line in found["skipped"]] == ["cpprb", "torchrl"]
+    assert all("pip install 'navaclq[bench]'" in line for line in found["skipped"])
+    assert set(found["ratios"]) == {"update_over_replay_cost"}
+    assert "navaclq: cycle" in rows
+
+
+def test_rivals_get_the_observations_that_the_replay_gathers():
+    config = resolve("fast", overrides=("replay.capacity=10000", "sac.batch_size=64"))
+    learner, rng = Learner(config), np.random.default_rng(0)
+    learner.insert(bench.synthetic_episode(config, 25, rng), 0)
+    chunk = next(bench._chunks(learner))
+    size = ObservationLayout.of(config).size
+    assert chunk["obs"].shape == chunk["next_obs"].shape == (bench.CHUNK, size)
+    batch = learner.replay.sample(64, config.sac.n_step, config.sac.gamma, 0.4)
+    flat = learner.sac.perception(batch.observation).numpy().astype(np.float16)
+    assert {row.tobytes() for row in flat} <= {row.tobytes() for row in chunk["obs"]}
+
+
+def test_bench_learner_compares_with_stable_baselines3_and_the_products_on_one_and_two_threads(
+    monkeypatch, capsys
+):
+    pytest.importorskip("stable_baselines3")
+    found, rows = navaclq(monkeypatch, capsys, "learner", "--rounds", 1)
+    assert set(rows) == {f"{name}, {n} thread(s)" for name in ("navaclq", "products", "sb3") for n in (1, 2)}
+    ratios = found["ratios"]
+    assert {"over_sb3_1_thread", "over_sb3_2_threads", "over_matmul_limit"} <= set(ratios)
+    # of one round: what the rows say
+    expected = rows["navaclq, 1 thread(s)"] / rows["sb3, 1 thread(s)"]
+    assert ratios["over_sb3_1_thread"] == pytest.approx(expected, rel=0.01)
+    assert ratios["over_matmul_limit"] < 1.5
