@@ -60,9 +60,6 @@ class RunDirectory:
             if source is not None:
                 raise UsageError(f"{folder} exists; to begin from {source} choose another --run")
             self.config = self._open(identity, config)
-            with self._writing():
-                for name in ("checkpoints", "snapshots"):
-                    finish_saving(folder / name)
         elif config is None:
             raise UsageError(f"{folder} is no run directory: it has no run.json")
         elif folder.exists() and not {path.name for path in folder.iterdir()} <= BEFORE_IDENTITY:
@@ -132,11 +129,13 @@ class RunDirectory:
         return score if math.isfinite(score) else -math.inf
 
     def next_epoch(self) -> int:
-        """Counts one more start of the learner and remembers it; never runs backwards."""
+        """Counts one more start of the learner, which may write from now on; never runs backwards."""
         identity = self.folder / "run.json"
         values = json.loads(identity.read_text("utf-8"))
         values["epoch"] += 1
         with self._writing():
+            for name in ("checkpoints", "snapshots"):
+                finish_saving(self.folder / name)
             write_atomically(identity, json.dumps(values).encode())
         return int(values["epoch"])
 
@@ -164,7 +163,7 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Whole checkpoints, oldest first."""
-        return _whole(self.folder / "checkpoints")
+        return sorted(p for p in (self.folder / "checkpoints").glob("*") if p.suffix != ".part")
 
     def restore(self, learner: Learner) -> None:
         """Loads the newest checkpoint, if there is one, once the replay holds its episodes again."""
@@ -190,11 +189,6 @@ class RunDirectory:
         save_folder(folder, {CONFIG: self.config.to_toml(), STATE: json.dumps(state)}, tensors)
 
 
-def _whole(parent: Path) -> list[Path]:
-    """Checkpoints that are whole, oldest first."""
-    return sorted(path for path in parent.glob("*") if path.suffix != ".part")
-
-
 def _weights_for(config: Config, encoder: Encoder, source: Path) -> dict[str, Tensor]:
     """The networks of a checkpoint, or of a run's newest one.
 
@@ -202,9 +196,10 @@ def _weights_for(config: Config, encoder: Encoder, source: Path) -> dict[str, Te
     another encoder made the codes that they read.
     """
     if (source / "run.json").exists():
-        if not _whole(source / "checkpoints"):
+        checkpoints = RunDirectory(source).checkpoints()
+        if not checkpoints:
             raise UsageError(f"{source} has no checkpoint yet")
-        source = _whole(source / "checkpoints")[-1]
+        source = checkpoints[-1]
     networks, sac = load_tensors(source / NETWORKS), SAC(config)
     try:
         sac.load_weights(networks)

@@ -703,6 +703,7 @@ def test_run_that_is_opened_again_after_a_kill_has_whole_folders_only(tmp_path, 
     with killed_at(monkeypatch, place, name, call):
         save(2)
     again = RunDirectory(tmp_path / "x")
+    again.next_epoch()
     assert names(run.folder / "checkpoints") == ["00001-000000000", "00001-000000007"]
     assert names(run.folder / "snapshots") == ["best"]
     if kind == "snapshots":

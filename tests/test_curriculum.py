@@ -49,8 +49,7 @@ class Learner:
         layout = ObservationLayout.of(config)
         self.policy, self.critic = Policy(layout, config.network), TwinCritic(layout, config.network)
         self.perception, self.layout = Perception(config), layout
-        for critic in self.critic.critics:
-            torch.nn.init.normal_(critic.output.weight)  # so that starts differ in value
+        torch.nn.init.normal_(self.critic.net.output.weights[0])  # so that starts differ in value
 
     def tensors(self) -> dict[str, torch.Tensor]:
         return state_of(policy=self.policy, critic=self.critic, perception=self.perception)
@@ -60,8 +59,8 @@ class Learner:
         flat = np.concatenate([visual, candidate.lidar.astype(np.float32), np.zeros(12, np.float32)])
         x = torch.from_numpy(flat)[None]
         with torch.no_grad():
-            action = torch.tanh(self.policy.net(x)[:, :2])
-            first, second = (critic(x, action).item() for critic in self.critic.critics)
+            action = torch.tanh(self.policy.net(x)[0, :, :2])
+            first, second = self.critic.net(x, action).flatten().tolist()
         assert first != second
         return min(first, second)
 
@@ -264,7 +263,7 @@ def test_q_is_cached_until_weights_of_another_version_come():
 
 def test_weights_that_do_not_fit_are_refused_naming_the_tensor():
     other = small_config("network.hidden=[24, 16]")
-    with pytest.raises(ValueError, match=r"tensor policy\.net\.head\.0\.weight is of shape \(24, 32\)"):
+    with pytest.raises(ValueError, match=r"tensor policy\.net\.fusion\.bias is of shape \(1, 1, 24\)"):
         CriticView(PLUS).load(Version(), Learner(other).tensors())
 
 
