@@ -41,6 +41,7 @@ from common.observation import ObservationLayout
 from common.resources import check_memory, learner_threads
 from common.telemetry import Rate, Reporter
 from common.weights import pack
+from common.world_config import StartRanges
 from learner.checkpoint import RunDirectory
 from learner.learner import Learner
 from learner.log import EpisodeLog
@@ -48,26 +49,27 @@ from learner.replay.buffer import Replay
 from learner.sac import Losses
 
 log = logging.getLogger(__name__)
-BEST_OF = 200
-"""Random tasks whose success decides which policy is the best so far; at least half of them must be there."""
+BEST_OF = 100
+"""Tasks whose success decides which policy is the best so far; at least half of them must be there."""
 
 
 class Progress:
     """What the run has achieved so far, over the last 500 episodes where it is an average."""
 
-    def __init__(self) -> None:
+    def __init__(self, full: StartRanges) -> None:
+        self._full = full
         self.recent: deque[tuple[str, float, int, str]] = deque(maxlen=500)
         """(ending, return, length, category)."""
         self.staleness: deque[int] = deque(maxlen=100)
         self.losses: deque[Losses] = deque(maxlen=200)
         self.random_tasks: deque[bool] = deque(maxlen=BEST_OF)
-        """Whether tasks of the whole distribution, which no curriculum chose, succeeded."""
+        """Whether tasks that no curriculum chose, drawn from the full ranges of starts, succeeded."""
 
     def add(self, episode: Episode) -> None:
         """Takes note of an episode."""
         item = (episode.ending, float(episode.reward.sum()), episode.length, episode.category)
         self.recent.append(item)
-        if episode.category in ("random", "unserved"):
+        if episode.category in ("random", "unserved") and episode.task.start == self._full:
             self.random_tasks.append(episode.ending == "success")
 
     def success(self, last: int) -> float:
@@ -124,7 +126,7 @@ class LearnerService:
         self._epoch = run.next_epoch()
         sync = config.learner.durability == "host"
         self._log = EpisodeLog(run.folder / "log", config.replay.capacity, sync=sync)
-        self.progress = Progress()
+        self.progress = Progress(config.world.start)
         self._best = run.best_score
         self._failed_writes, self._complained = 0, -math.inf
         self._restore()

@@ -17,6 +17,9 @@ from common.messages import Ending, Episode, Version
 from common.observation import ACTION_SIZE, ObservationLayout
 from common.tasks import Task
 
+PATIENCE = 3.0
+"""Times as long as on a quiet machine that tests wait for what must happen."""
+
 
 def free_port() -> int:
     """A TCP port on loopback that nobody listens on."""
@@ -31,7 +34,8 @@ def free_endpoint() -> str:
 
 
 def wait_until(condition: Callable[[], Any], timeout: float = 10.0, what: str = "the condition") -> Any:
-    """The first true value of `condition`, polled every 5 ms; fails after `timeout` s."""
+    """The first true value of `condition`, polled every 5 ms; fails after `timeout` s of a quiet machine."""
+    timeout *= PATIENCE
     deadline = time.monotonic() + timeout
     while not (value := condition()):
         if time.monotonic() > deadline:

@@ -239,13 +239,13 @@ def learner_is_killed(crew: Crew, times: int, seed: int) -> None:
     assert not list(crew.run.rglob("*.part"))
 
 
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(480)
 def test_learner_that_is_killed_three_times_loses_nothing_and_learns_on(crew):
     learner_is_killed(crew, 3, seed=1)
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_learner_that_is_killed_twenty_times_loses_nothing_and_learns_on(crew):
     learner_is_killed(crew, 20, seed=2)
 
@@ -421,7 +421,7 @@ def disk_fills_up(crew: Crew, disk: Disk) -> None:
     newest = sorted(path.name for path in checkpoints.glob("0*[0-9]"))[-1]
     said = len(crew.words("learner"))
     crew.start_learner()
-    assert crew.running["learner"].wait(60) == 2, "it cannot even count its start"
+    assert crew.running["learner"].wait(120) == 2, "it cannot even count its start"
     assert_one_sentence(crew.words("learner")[said:], str(disk.folder / "run"), "No space left on device")
     disk.make_room()
     crew.start_learner()
@@ -466,7 +466,9 @@ def test_run_directory_that_cannot_be_written_is_named_in_one_sentence(disk, rea
     else:
         disk.fill()
     before = {path: path.stat().st_size for path in sorted((disk.outside / "run").glob("*.*"))}
-    done = subprocess.run([*command, "--listen", free_endpoint()], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [*command, "--listen", free_endpoint()], capture_output=True, text=True, timeout=120
+    )
     assert_one_sentence(done.stderr, str(run), reason)
     assert done.returncode == 2
     assert (
@@ -503,7 +505,7 @@ def test_learner_that_is_stopped_with_a_full_disk_says_so_and_resumes_from_what_
         disk.make_room()
         said = len(words)
         crew.start_learner()
-        found = wait_until(lambda: RESUMED.findall(crew.words("learner")[said:]), 30, "resuming")
+        found = wait_until(lambda: RESUMED.findall(crew.words("learner")[said:]), 60, "resuming")
         episodes, _, _, updates = map(int, found[0])
         assert episodes == feeder.sent
         assert updates >= int(newest[6:]) > 0
@@ -545,9 +547,9 @@ def checkpointed(crew: Crew) -> tuple[list[Path], int]:
             assert not feeder.deliver(feeder.episode(feeder.sent), feeder.sent).duplicate
             return [path for path in kept() if not path.name.endswith("-000000000")]
 
-        wait_until(lambda: len(fed()) >= 2, 30, "two checkpoints")
+        wait_until(lambda: len(fed()) >= 2, 60, "two checkpoints")
         updates = crew.figure("updates")
-        wait_until(lambda: fed() and crew.figure("updates") > updates, 30, "more updates")
+        wait_until(lambda: fed() and crew.figure("updates") > updates, 60, "more updates")
     assert crew.stop("learner") == 0
     return kept(), feeder.sent
 
@@ -566,13 +568,13 @@ def test_checkpoint_cut_in_half_is_named_and_the_one_before_it_resumed(crew, fil
     os.truncate(cut, cut.stat().st_size // 2)
     said = len(crew.words("learner"))
     crew.start_learner()
-    assert crew.running["learner"].wait(30) == 2
+    assert crew.running["learner"].wait(120) == 2
     assert_one_sentence(crew.words("learner")[said:], str(newest))
 
     shutil.rmtree(newest)
     crew.start_learner()
     episodes, steps, transitions, updates = map(
-        int, wait_until(lambda: RESUMED.findall(crew.words("learner")[said:]), 30, "resuming")[0]
+        int, wait_until(lambda: RESUMED.findall(crew.words("learner")[said:]), 60, "resuming")[0]
     )
     assert (episodes, steps, transitions) == (count, 20 * count, 20 * count)
     assert updates == int(before.name.partition("-")[2]) > 0
@@ -582,7 +584,7 @@ def test_checkpoint_cut_in_half_is_named_and_the_one_before_it_resumed(crew, fil
         assert feeder.deliver(feeder.episode(0), count - 1).duplicate
         for seq in range(count, count + 10):
             feeder.deliver(feeder.episode(seq), seq)
-        wait_until(lambda: crew.figure("updates") > updates, 30, "more updates")
+        wait_until(lambda: crew.figure("updates") > updates, 60, "more updates")
     assert crew.stop("learner") == 0
 
 
