@@ -14,9 +14,10 @@ import torch
 from torch import nn
 
 from common import encoders
-from common.config import Config, resolve
+from common.config import Config, differing_keys, resolve
 from common.encoders import (
     ENCODER,
+    MADE_BY,
     RANDOM,
     SHIPPED,
     SHIPPED_FOLDER,
@@ -80,7 +81,7 @@ def test_encoder_is_read_back_to_the_bit_with_its_configuration(tmp_path, kind, 
     config = settings(kind, frames_per_code)
     encoder = trained(config)
     made_with, found = read_encoder(saved(tmp_path / "mine", config, encoder))
-    assert made_with == config
+    assert not differing_keys(made_with, config, MADE_BY)
     assert same(found, encoder)
     assert not same(found, make_encoder(config))
 
@@ -231,9 +232,17 @@ def test_damaged_weights_are_a_usage_error_and_stay_as_they_are(tmp_path, damage
 
 def test_encoder_of_another_version_says_so(tmp_path):
     folder = saved(tmp_path / "mine", settings())
-    (folder / CONFIG).write_text(settings().to_toml() + "\n[unheard_of]\nx = 1\n")
+    text = settings().to_toml()
+    (folder / CONFIG).write_text(text.replace("[encoder]\n", "[encoder]\nunheard_of = 1\n"))
     with pytest.raises(UsageError, match=r"mine was made by another version of navaclq: .*unheard_of"):
         read_encoder(folder)
+
+
+def test_encoder_outlives_changes_of_settings_that_it_was_not_made_by(tmp_path):
+    folder = saved(tmp_path / "mine", settings())
+    text = settings().to_toml().replace("[learner]\n", "[learner]\nunheard_of = 1\n")
+    (folder / CONFIG).write_text(text + "\n[unheard_of]\nx = 1\n")
+    assert read_encoder(folder)[0].encoder == settings().encoder
 
 
 def test_packed_encoder_is_the_file_and_its_hash_tells_encoders_apart(tmp_path):

@@ -123,7 +123,7 @@ def test_actions_are_uniform_before_the_first_update_and_the_policys_after_it():
 def test_weights_of_another_architecture_are_refused_naming_the_tensor():
     other = resolve("smoke", overrides=("network.hidden=[16,16]",))
     actor = PolicyActor(SMOKE, 1, np.random.default_rng(0))
-    with pytest.raises(ValueError, match=r"policy\.net\.head\.0\.weight"):
+    with pytest.raises(ValueError, match=r"policy\.net\.fusion\.bias"):
         actor.load(Version(epoch=1, counter=1), networks(other))
 
 
