@@ -22,8 +22,8 @@ def flatten(parameters: Iterable[Tensor]) -> Tensor:
 class FlatAdam:
     """Adam over one vector of which the given parameters are views.
 
-    torch's Adam spends more on each of twenty small tensors than on their numbers: as one vector an update of
-    SAC takes 2.5 ms less of 30.
+    Parameters, gradient and targets of a loss are one vector each; it is no faster than torch's fused Adam
+    over the parameters one by one (2.3 and 2.2 ms for critics and policy of preset `fast`).
     """
 
     def __init__(self, parameters: Iterable[Tensor], rate: float) -> None:
