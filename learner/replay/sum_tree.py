@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FAN = 16
-"""Children of a node. A step of numpy costs so much for being a step that three wide levels take two thirds of
-the time of the twenty of a binary tree over 2^20 leaves to search, and a tenth to write; they draw the same."""
+"""Children of a node. A step of numpy costs so much for being a step that three wide levels take two thirds
+of the time of the twenty of a binary tree over 2^20 leaves to search, a tenth to write, and draw alike."""
 
 
 class SumTree:
