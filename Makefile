@@ -6,7 +6,7 @@ endif
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: setup train test test-slow encoders format clean
+.PHONY: setup train test coverage test-slow encoders format clean
 
 setup: .venv/.installed
 
@@ -22,6 +22,10 @@ test: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/pytest -m "not slow" $(ARGS)
+
+# The same tests with what they cover, which takes two thirds longer.
+coverage: setup
 	$(BIN)/pytest -m "not slow" --cov --cov-report=term $(ARGS)
 
 test-slow: setup
