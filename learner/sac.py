@@ -16,7 +16,7 @@ from common.config import Config
 from common.errors import UsageError
 from common.networks import Perception, Policy, TwinCritic, load_state, state_of
 from common.observation import ACTION_SIZE, Observation, ObservationLayout
-from learner.optimizers import FlatAdam, flatten, load_moments, moments_of
+from learner.optimizers import load_moments, moments_of
 from learner.replay.buffer import Batch
 
 WATCH_INTERVAL = 10
@@ -100,14 +100,17 @@ class SAC:
         if config.encoder.end_to_end:
             self._modules["target_perception"] = self.target_perception
         self._end_to_end = config.encoder.end_to_end
+        self._online: list[Tensor] = [*self.critic.parameters(), *self.perception.parameters()]
+        self._targets: list[Tensor] = [*self.target.parameters(), *self.target_perception.parameters()]
         learned = {
-            "critic": [*self.critic.parameters(), *self.perception.parameters()],
+            "critic": self._online,
             "policy": self.policy.parameters(),
             "temperature": [self.log_alpha],
         }
         rate = config.sac.learning_rate
-        self.optimizers = {name: FlatAdam(parameters, rate) for name, parameters in learned.items()}
-        self._targets = flatten([*self.target.parameters(), *self.target_perception.parameters()])
+        self.optimizers = {
+            name: torch.optim.Adam(parameters, rate, fused=True) for name, parameters in learned.items()
+        }
 
     @property
     def alpha(self) -> Tensor:
@@ -144,7 +147,7 @@ class SAC:
         flat = self.perception(batch.observation)
         q = self.critic(flat, action)
         loss = critic_loss(q, target, weight, sac.critic_loss)
-        self.optimizers["critic"].step(loss)
+        self._step("critic", loss)
         policy, entropy = math.nan, math.nan
         if self.policy_due:
             if actor_batch is not None:
@@ -161,20 +164,28 @@ class SAC:
         sac = self.config.sac
         action, log_density = self.policy.sample(flat, self._noise(len(flat)))
         loss = policy_loss(self.critic(flat, action), self.alpha, log_density)
-        self.optimizers["policy"].step(loss)
+        self._step("policy", loss)
         log_density = log_density.detach()
-        self.optimizers["temperature"].step(temperature_loss(self.log_alpha, log_density, sac.target_entropy))
+        self._step("temperature", temperature_loss(self.log_alpha, log_density, sac.target_entropy))
         if sac.alpha_floor > 0:
             with torch.no_grad():
                 self.log_alpha.clamp_(min=math.log(sac.alpha_floor))
         return loss.item(), -log_density.mean().item()
 
     def _update_targets(self) -> None:
-        sac, online = self.config.sac, self.optimizers["critic"].vector
-        if sac.target == "soft":
-            self._targets.lerp_(online, sac.tau)
-        elif self.updates % sac.target_interval == 0:
-            self._targets.copy_(online)
+        sac = self.config.sac
+        with torch.no_grad():
+            if sac.target == "soft":
+                torch._foreach_lerp_(self._targets, self._online, sac.tau)
+            elif self.updates % sac.target_interval == 0:
+                torch._foreach_copy_(self._targets, self._online)
+
+    def _step(self, name: str, loss: Tensor) -> None:
+        """One step down the gradient with respect to what the optimiser learns, and to nothing else."""
+        parameters = self.optimizers[name].param_groups[0]["params"]
+        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+            parameter.grad = gradient
+        self.optimizers[name].step()
 
     def _noise(self, size: int) -> Tensor:
         return torch.randn(size, ACTION_SIZE, generator=self._generator).to(self.log_alpha)
@@ -194,7 +205,7 @@ class SAC:
         networks["log_alpha"] = self.log_alpha.detach()
         moments: dict[str, Tensor] = {}
         for name, optimizer in self.optimizers.items():
-            moments |= moments_of(name, optimizer.adam)
+            moments |= moments_of(name, optimizer)
         moments["generator"] = self._generator.get_state()
         return networks, moments
 
@@ -208,6 +219,6 @@ class SAC:
         with torch.no_grad():
             self.log_alpha.copy_(networks["log_alpha"])
         for name, optimizer in self.optimizers.items():
-            load_moments(name, optimizer.adam, moments)
+            load_moments(name, optimizer, moments)
         self._generator.set_state(moments["generator"])
         self.updates = updates
