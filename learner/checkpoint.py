@@ -27,8 +27,10 @@ from learner.sac import SAC
 RUN_SCHEMA = 3
 """Version of the run directory's layout."""
 OPTIMIZERS, PRIORITIES, STATE = "optimizers.safetensors", "priorities.safetensors", "state.json"
-BEFORE_IDENTITY = {"logs", "spool", CONFIG, ENCODER, "checkpoints", "run.json.part"}
-"""What may be there without run.json: the launcher's, and that of a start which was interrupted."""
+STARTING = "run.json.part"
+"""There from the beginning of a start to its end: without run.json, that of a start which was interrupted."""
+FROM_LAUNCHER = {"logs", "spool"}
+FROM_START = {STARTING, CONFIG, ENCODER, "checkpoints"}
 FIRST = Version()
 """Of the checkpoint with which a run begins that takes its weights from another."""
 
@@ -62,7 +64,7 @@ class RunDirectory:
             self.config = self._open(identity, config)
         elif config is None:
             raise UsageError(f"{folder} is no run directory: it has no run.json")
-        elif folder.exists() and not {path.name for path in folder.iterdir()} <= BEFORE_IDENTITY:
+        elif not self._may_start():
             raise UsageError(f"{folder} is not empty and no run directory; choose another --run")
         else:
             self.config = config
@@ -70,6 +72,7 @@ class RunDirectory:
             weights = _weights_for(config, encoder, source) if encoder and source else None
             with self._writing():
                 folder.mkdir(parents=True, exist_ok=True)
+                (folder / STARTING).touch()
                 (folder / CONFIG).write_text(config.to_toml(), "utf-8")
                 if encoder is not None:
                     (folder / ENCODER).write_bytes(pack_encoder(encoder))
@@ -78,6 +81,11 @@ class RunDirectory:
                     self._write(self._checkpoint(FIRST), {NETWORKS: weights}, {"from": str(source)})
                 identity_values = {"schema": RUN_SCHEMA, "job": job, "epoch": 0}
                 write_atomically(identity, json.dumps(identity_values).encode())
+
+    def _may_start(self) -> bool:
+        """Whether nothing of anybody else's is there."""
+        names = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
+        return names <= FROM_LAUNCHER | (FROM_START if STARTING in names else set())
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

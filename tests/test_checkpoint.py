@@ -185,6 +185,15 @@ def test_foreign_folder_is_left_alone(tmp_path):
     assert not (tmp_path / "absent").exists()
 
 
+@pytest.mark.parametrize("name", ["config.toml", "encoder.safetensors", "checkpoints/1/weights"])
+def test_files_of_others_with_our_names_are_left_alone(tmp_path, name):
+    (tmp_path / "x" / name).parent.mkdir(parents=True)
+    (tmp_path / "x" / name).write_text("mine")
+    with pytest.raises(UsageError, match="is not empty and no run directory"):
+        RunDirectory(tmp_path / "x", CONFIG)
+    assert (tmp_path / "x" / name).read_text() == "mine"
+
+
 def test_folder_that_holds_only_what_the_launcher_puts_there_becomes_a_run(tmp_path):
     for name in ("logs", "spool"):
         (tmp_path / "x" / name).mkdir(parents=True)
@@ -623,7 +632,6 @@ def test_start_from_nothing_takes_no_weights_from_an_interrupted_one(tmp_path, m
     trained(origin)
     with killed_at(monkeypatch, Path, "replace"):
         started_from(tmp_path, origin.folder)
-    (tmp_path / "y" / "run.json.part").unlink(missing_ok=True)
     assert (tmp_path / "y" / "checkpoints" / FIRST).is_dir()
     run, learner = RunDirectory(tmp_path / "y", CONFIG), Learner(CONFIG)
     run.restore(learner)
