@@ -50,18 +50,17 @@ def bench_learner(config: Config, rounds: int, soak: int, progress: Callable[[in
         report.add(f"{name}, {threads} thread(s)", 1 / median(seconds), "updates/s")
     for threads in THREADS:
         suffix = f"_{threads}_thread{'s' if threads > 1 else ''}"
+        of_limit = "over_matmul_limit" + (suffix if threads > 1 else "")
         ours, limit = times["navaclq", threads], times["products", threads]
         if "sb3" in works:
             theirs = times["sb3", threads]
             report.compare(f"over_sb3{suffix}", theirs, ours)
-            report.compare(f"sb3_over_matmul_limit{suffix}", limit, theirs)
-        report.compare(f"over_matmul_limit{suffix}", limit, ours)
+            report.compare(f"sb3_{of_limit}", limit, theirs)
+        report.compare(of_limit, limit, ours)
     if soak:
         report.add(f"rss_growth_over_{soak}_updates", _soak(config, soak), "MB")
     else:
         report.skipped.append("growth of memory: ask for it with --soak UPDATES")
-    report.ratios["over_matmul_limit"] = report.ratios["over_matmul_limit_1_thread"]
-    report.quartiles["over_matmul_limit"] = report.quartiles["over_matmul_limit_1_thread"]
     return report
 
 

@@ -77,9 +77,8 @@ def bench_replay(config: Config, rounds: int, progress: Callable[[int, str], Non
     torch.set_num_threads(1)
     for i in range(rounds):
         for name, cycle in cycles.items():
-            times[name].append(_time(lambda c=cycle: [c(rng) for _ in range(20)]) / 20)  # type: ignore[misc]
-        batch = _sample(learner)
-        times["update"].append(_time(lambda b=batch: learner.sac.update(b)))  # type: ignore[misc]
+            times[name].append(_time(cycle, rng, repeat=20))
+        times["update"].append(_time(learner.sac.update, _sample(learner)))
         progress(i + 1, "")
     for name, seconds in times.items():
         report.add(f"{name}: {'SAC update' if name == 'update' else 'cycle'}", 1e3 * median(seconds), "ms")
@@ -91,10 +90,11 @@ def bench_replay(config: Config, rounds: int, progress: Callable[[int, str], Non
     return report
 
 
-def _time(work: Callable[[], object]) -> float:
+def _time(work: Callable[..., object], *arguments: object, repeat: int = 1) -> float:
     began = time.perf_counter()
-    work()
-    return time.perf_counter() - began
+    for _ in range(repeat):
+        work(*arguments)
+    return (time.perf_counter() - began) / repeat
 
 
 def _sample(learner: Learner) -> Batch:
