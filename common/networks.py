@@ -167,10 +167,20 @@ class ParallelLinear(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """(B, inputs) for all members or (members, B, inputs) each -> (members, B, outputs)."""
-        factors = [(x.expand(len(w), -1, -1), w) for x, w in zip(inputs, self.weights, strict=True)]
-        out = torch.baddbmm(self.bias, *factors[0])
-        for pair in factors[1:]:
-            out.baddbmm_(*pair)
+        return self._add(self.bias, inputs, list(self.weights))
+
+    def begin(self, *inputs: Tensor) -> Tensor:
+        """What the first inputs contribute, and the bias."""
+        return self._add(self.bias, inputs, list(self.weights)[: len(inputs)])
+
+    def extend(self, out: Tensor, *inputs: Tensor) -> Tensor:
+        """Adds to `out`, which `begin` gave, what the last inputs contribute."""
+        return self._add(out, inputs, list(self.weights)[-len(inputs) :] if inputs else [])
+
+    @staticmethod
+    def _add(out: Tensor, inputs: tuple[Tensor, ...], weights: list[nn.Parameter]) -> Tensor:
+        for x, w in zip(inputs, weights, strict=True):
+            out = torch.baddbmm(out, x if x.dim() == 3 else x.expand(len(w), -1, -1), w)
         return out
 
 
@@ -224,14 +234,23 @@ class FusionNetwork(nn.Module):
         )
         self.output = ParallelLinear(members, (config.hidden[-1],), outputs)
 
-    def forward(self, flat: Tensor, *extra: Tensor) -> Tensor:
-        """(B, layout.size), and (B, extra) if any -> (members, B, outputs)."""
+    def embed(self, flat: Tensor) -> Tensor:
+        """(B, layout.size) -> (members, B, hidden): the first layer after fusion, without what is extra."""
         parts = [flat]
         if self._branched:
             visual, lidar, history = torch.split(flat, self._sizes, dim=-1)
             parts = [visual, self.lidar_branch(lidar), self.history_branch(history)]
-        out: Tensor = self.output(self.head(self.fusion(*parts, *extra)))
+        embedded: Tensor = self.fusion.begin(*parts)
+        return embedded
+
+    def finish(self, embedded: Tensor, *extra: Tensor) -> Tensor:
+        """What `embed` gave, and (B, extra) if any -> (members, B, outputs)."""
+        out: Tensor = self.output(self.head(self.fusion.extend(embedded, *extra)))
         return out
+
+    def forward(self, flat: Tensor, *extra: Tensor) -> Tensor:
+        """(B, layout.size), and (B, extra) if any -> (members, B, outputs)."""
+        return self.finish(self.embed(flat), *extra)
 
 
 class Policy(nn.Module):
@@ -244,8 +263,8 @@ class Policy(nn.Module):
     def forward(self, flat: Tensor) -> tuple[Tensor, Tensor]:
         """(B, layout.size) -> mean and log standard deviation before the tanh, (B, 2) each."""
         mean, log_std = self.net(flat)[0].chunk(2, dim=-1)
-        half = (LOG_STD_MAX - LOG_STD_MIN) / 2
-        return mean, LOG_STD_MIN + half * (torch.tanh(log_std) + 1)
+        middle, half = (LOG_STD_MAX + LOG_STD_MIN) / 2, (LOG_STD_MAX - LOG_STD_MIN) / 2
+        return mean, middle + half * torch.tanh(log_std)
 
     def mode(self, flat: Tensor) -> Tensor:
         """The greedy action tanh(mean), (B, 2)."""
@@ -254,11 +273,11 @@ class Policy(nn.Module):
     def sample(self, flat: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Reparameterised action (B, 2) for standard normal `noise` (B, 2), and its log density (B,)."""
         mean, log_std = self(flat)
-        raw = mean + log_std.exp() * noise
-        log_density = (-0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
+        raw = torch.addcmul(mean, log_std.exp(), noise)
+        log_gaussian = -0.5 * noise**2 - 0.5 * math.log(2 * math.pi) - log_std
         # log(1 - tanh(raw)^2), written so that it does not underflow
-        log_jacobian = (2 * (math.log(2) - raw - F.softplus(-2 * raw))).sum(-1)
-        return torch.tanh(raw), log_density - log_jacobian
+        log_jacobian = 2 * (math.log(2) - raw - F.softplus(-2 * raw))
+        return torch.tanh(raw), (log_gaussian - log_jacobian).sum(-1)
 
 
 class TwinCritic(nn.Module):
@@ -270,8 +289,11 @@ class TwinCritic(nn.Module):
 
     def forward(self, flat: Tensor, action: Tensor) -> Tensor:
         """(B, layout.size), (B, 2) -> (2, B)."""
-        twins: Tensor = self.net(flat, action).squeeze(-1)
-        return twins
+        return self.judge(self.net.embed(flat), action)
+
+    def judge(self, embedded: Tensor, action: Tensor) -> Tensor:
+        """What `net.embed` made of the observation, which actions can share, (B, 2) -> (2, B)."""
+        return self.net.finish(embedded, action).squeeze(-1)
 
 
 class Normalizer(nn.Module):
@@ -323,7 +345,7 @@ class Perception(nn.Module):
         parts = [observation.lidar, observation.history]
         if self.encoder is None:
             parts.insert(0, observation.visual)
-        return torch.cat([torch.from_numpy(part).flatten(1).to(self._like) for part in parts], dim=1)
+        return torch.cat([torch.from_numpy(part).flatten(1) for part in parts], dim=1).to(self._like)
 
     def forward(self, observation: Observation) -> Tensor:
         """B observations -> (B, layout.size) float32."""

@@ -24,7 +24,7 @@ from common.policy_files import CONFIG, NETWORKS, finish_saving, load_tensors, s
 from learner.learner import Learner
 from learner.sac import SAC
 
-RUN_SCHEMA = 3
+RUN_SCHEMA = 4
 """Version of the run directory's layout."""
 OPTIMIZERS, PRIORITIES, STATE = "optimizers.safetensors", "priorities.safetensors", "state.json"
 STARTING = "run.json.part"

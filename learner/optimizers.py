@@ -24,7 +24,8 @@ def load_moments(name: str, optimizer: Optimizer, moments: dict[str, Tensor]) ->
             for key in ("step", "exp_avg", "exp_avg_sq")
             if f"{name}.{index}.{key}" in moments
         }
-        for index in state["param_groups"][0]["params"]
+        for group in state["param_groups"]
+        for index in group["params"]
         if f"{name}.{index}.step" in moments
     }
     optimizer.load_state_dict(state)

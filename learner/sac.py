@@ -35,7 +35,7 @@ class Losses(NamedTuple):
 
 def td_target(reward: Tensor, discount: Tensor, q_next: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
     """r + discount (min_i Q_i(s', a') - alpha log pi(a' | s')); all (B,) but q_next (2, B)."""
-    return reward + discount * (q_next.min(0).values - alpha * log_density)
+    return reward + discount * (torch.minimum(*q_next) - alpha * log_density)
 
 
 def critic_loss(q: Tensor, target: Tensor, weight: Tensor, kind: str = "squared") -> Tensor:
@@ -53,7 +53,7 @@ def critic_loss(q: Tensor, target: Tensor, weight: Tensor, kind: str = "squared"
 
 def policy_loss(q: Tensor, alpha: Tensor, log_density: Tensor) -> Tensor:
     """J_pi: mean of alpha log pi(a | s) - min_i Q_i(s, a); q (2, B)."""
-    return (alpha * log_density - q.min(0).values).mean()
+    return (alpha * log_density - torch.minimum(*q)).mean()
 
 
 def temperature_loss(log_alpha: Tensor, log_density: Tensor, target_entropy: float) -> Tensor:
@@ -102,15 +102,13 @@ class SAC:
         self._end_to_end = config.encoder.end_to_end
         self._online: list[Tensor] = [*self.critic.parameters(), *self.perception.parameters()]
         self._targets: list[Tensor] = [*self.target.parameters(), *self.target_perception.parameters()]
-        learned = {
+        self._learned: dict[str, list[Tensor]] = {
             "critic": self._online,
-            "policy": self.policy.parameters(),
+            "policy": list(self.policy.parameters()),
             "temperature": [self.log_alpha],
         }
-        rate = config.sac.learning_rate
-        self.optimizers = {
-            name: torch.optim.Adam(parameters, rate, fused=True) for name, parameters in learned.items()
-        }
+        groups = [{"name": name, "params": parameters} for name, parameters in self._learned.items()]
+        self.optimizer = torch.optim.Adam(groups, config.sac.learning_rate, fused=True)
 
     @property
     def alpha(self) -> Tensor:
@@ -127,6 +125,8 @@ class SAC:
     ) -> tuple[Losses, NDArray[np.float64]]:
         """One gradient step on all that is due; returns figures and |TD error| (B,), the twins' mean.
 
+        All gradients are taken before any step, as Haarnoja et al. 2018 do in their code (algorithm 3, like
+        theirs, lists the steps in turn): what the critics make of the observations serves J_Q and J_pi alike.
         With `actor_batch` policy and temperature learn from those observations in place of the batch's.
         """
         sac = self.config.sac
@@ -145,32 +145,40 @@ class SAC:
                 reward, discount, self.target(following, next_action), self.alpha, next_log_density
             )
         flat = self.perception(batch.observation)
-        q = self.critic(flat, action)
+        embedded = self.critic.net.embed(flat)
+        q = self.critic.judge(embedded, action)
         loss = critic_loss(q, target, weight, sac.critic_loss)
-        self._step("critic", loss)
+        self.optimizer.zero_grad()
+        self._descend("critic", loss)
         policy, entropy = math.nan, math.nan
         if self.policy_due:
             if actor_batch is not None:
                 with torch.no_grad():
                     flat = self.perception(actor_batch)
-            policy, entropy = self._update_policy(flat.detach())
+                    embedded = self.critic.net.embed(flat)
+            policy, entropy = self._descend_policy(flat.detach(), embedded.detach())
+        self.optimizer.step()
         self.updates += 1
+        self._bound_temperature()
         self._update_targets()
         errors = (q.detach() - target).abs().mean(0).double().cpu().numpy()
         figures = Losses(loss.item(), q.detach().mean().item(), policy, entropy, self.alpha.item())
         return figures, errors
 
-    def _update_policy(self, flat: Tensor) -> tuple[float, float]:
-        sac = self.config.sac
+    def _descend_policy(self, flat: Tensor, embedded: Tensor) -> tuple[float, float]:
         action, log_density = self.policy.sample(flat, self._noise(len(flat)))
-        loss = policy_loss(self.critic(flat, action), self.alpha, log_density)
-        self._step("policy", loss)
+        loss = policy_loss(self.critic.judge(embedded, action), self.alpha, log_density)
+        self._descend("policy", loss)
         log_density = log_density.detach()
-        self._step("temperature", temperature_loss(self.log_alpha, log_density, sac.target_entropy))
-        if sac.alpha_floor > 0:
-            with torch.no_grad():
-                self.log_alpha.clamp_(min=math.log(sac.alpha_floor))
+        self._descend(
+            "temperature", temperature_loss(self.log_alpha, log_density, self.config.sac.target_entropy)
+        )
         return loss.item(), -log_density.mean().item()
+
+    def _bound_temperature(self) -> None:
+        if self.config.sac.alpha_floor > 0:
+            with torch.no_grad():
+                self.log_alpha.clamp_(min=math.log(self.config.sac.alpha_floor))
 
     def _update_targets(self) -> None:
         sac = self.config.sac
@@ -180,12 +188,11 @@ class SAC:
             elif self.updates % sac.target_interval == 0:
                 torch._foreach_copy_(self._targets, self._online)
 
-    def _step(self, name: str, loss: Tensor) -> None:
-        """One step down the gradient with respect to what the optimiser learns, and to nothing else."""
-        parameters = self.optimizers[name].param_groups[0]["params"]
+    def _descend(self, name: str, loss: Tensor) -> None:
+        """Sets the gradients of one group of parameters, and of nothing else, to those of its loss."""
+        parameters = self._learned[name]
         for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
             parameter.grad = gradient
-        self.optimizers[name].step()
 
     def _noise(self, size: int) -> Tensor:
         return torch.randn(size, ACTION_SIZE, generator=self._generator).to(self.log_alpha)
@@ -203,9 +210,7 @@ class SAC:
         """Networks and optimisers as flat dictionaries of tensors."""
         networks = state_of(**self._modules)
         networks["log_alpha"] = self.log_alpha.detach()
-        moments: dict[str, Tensor] = {}
-        for name, optimizer in self.optimizers.items():
-            moments |= moments_of(name, optimizer)
+        moments = moments_of("adam", self.optimizer)
         moments["generator"] = self._generator.get_state()
         return networks, moments
 
@@ -218,7 +223,6 @@ class SAC:
         self.load_weights(networks)
         with torch.no_grad():
             self.log_alpha.copy_(networks["log_alpha"])
-        for name, optimizer in self.optimizers.items():
-            load_moments(name, optimizer, moments)
+        load_moments("adam", self.optimizer, moments)
         self._generator.set_state(moments["generator"])
         self.updates = updates

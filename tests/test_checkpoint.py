@@ -130,7 +130,7 @@ def test_new_run_has_a_complete_configuration_and_an_identity(tmp_path):
     assert run.folder.joinpath("encoder.safetensors").read_bytes() == pack_encoder(make_encoder(CONFIG))
     assert run.encoder == pack_encoder(make_encoder(CONFIG))
     assert json.loads(run.folder.joinpath("run.json").read_text()) == {
-        "schema": 3,
+        "schema": 4,
         "job": "training",
         "epoch": 0,
     }
@@ -163,7 +163,7 @@ def test_setting_that_conflicts_with_the_run_is_named(tmp_path):
 def test_run_of_another_schema_is_refused_and_damage_reported(tmp_path, schema):
     identity = RunDirectory(tmp_path / "x", CONFIG).folder / "run.json"
     identity.write_text(json.dumps({"schema": schema, "job": "training", "epoch": 0}))
-    said = f"incompatible version: its run schema is {schema}, this version has 3"
+    said = f"incompatible version: its run schema is {schema}, this version has 4"
     with pytest.raises(UsageError, match=said):
         RunDirectory(tmp_path / "x", CONFIG)
     for damage in ("", "{", "[]", "{}", "3"):
@@ -569,8 +569,8 @@ def test_source_of_another_schema_or_job_is_refused(tmp_path):
     trained(origin)
     identity = origin.folder / "run.json"
     identity.write_text(json.dumps({"schema": 2, "job": "training", "epoch": 1}))
-    refused_start(tmp_path, origin.folder, "its run schema is 2, this version has 3")
-    identity.write_text(json.dumps({"schema": 3, "job": "pretraining", "epoch": 1}))
+    refused_start(tmp_path, origin.folder, "its run schema is 2, this version has 4")
+    identity.write_text(json.dumps({"schema": 4, "job": "pretraining", "epoch": 1}))
     refused_start(tmp_path, origin.folder, "is the folder of a pretraining")
 
 

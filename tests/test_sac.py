@@ -139,7 +139,7 @@ def test_target_of_an_update_uses_target_critics_fresh_actions_and_alpha():
 
 def still_critics(sac: SAC) -> SAC:
     """The same, with critics that do not learn, so that what the policy sees of them stays equal."""
-    sac.optimizers["critic"].param_groups[0]["lr"] = 0.0
+    sac.optimizer.param_groups[0]["lr"] = 0.0
     return sac
 
 
@@ -244,7 +244,7 @@ def test_alpha_falls_no_lower_than_its_floor(floor):
     )
     sac = SAC(config)
     assert sac.alpha.item() == pytest.approx(0.06)
-    sac.optimizers["policy"].param_groups[0]["lr"] = 0.0  # keeps the entropy above the target
+    sac.optimizer.param_groups[1]["lr"] = 0.0  # keeps the entropy above the target
     for seed in range(4):
         losses, _ = sac.update(make_batch(config, seed=seed))
     assert losses.alpha == sac.alpha.item()

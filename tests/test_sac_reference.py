@@ -246,9 +246,9 @@ class Reference:
             slope = np.clip(error, -1, 1) if self.sac.critic_loss == "huber" else error
             critic.backward((weight * slope / size)[:, None])
             gradients += critic.gradients
-        self.critic_adam.step(gradients)
-        if self.updates % self.sac.policy_delay == 0:
+        if self.updates % self.sac.policy_delay == 0:  # with the critics as they were
             self.update_policy(current if uniform is None else self.seen(uniform), alpha)
+        self.critic_adam.step(gradients)
         self.updates += 1
         self.update_targets()
         return np.mean(errors, axis=0)
