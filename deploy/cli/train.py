@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from common.bus import Keys, open_client
-from common.config import parse, resolve
+from common.config import Config, parse, resolve
 from common.contract import fetch_contract
 from common.errors import UsageError
 from common.messages import ContractReply
@@ -54,11 +54,9 @@ def train(
         options.configuration(preset, variant, config, settings, seed)
     if evaluation is not None:
         suite_tasks(evaluation, options.configuration(None, None, None, None, None))
-    cores = os.cpu_count() or 2
-    count = actors or max(1, cores - learner_threads("auto", cores))
     asked = _arguments(preset, variant, config, settings, seed)
     exit_on_signals()
-    load = _supervise(run, minutes or 40.0, count, f"tcp/127.0.0.1:{port or free_port()}", asked, source)
+    load = _supervise(run, minutes or 40.0, actors, f"tcp/127.0.0.1:{port or free_port()}", asked, source)
     result = _summary(run, load)
     if evaluation is not None:
         result["eval"] = _compare(run, evaluation, result["seed"])
@@ -78,7 +76,7 @@ def _arguments(
 
 
 def _supervise(
-    run: Path, minutes: float, count: int, address: str, asked: list[str], source: Path | None
+    run: Path, minutes: float, actors: int | None, address: str, asked: list[str], source: Path | None
 ) -> float:
     """Runs the processes until the learner's time is over; returns the load average at the end."""
     clock = _Clock()
@@ -97,6 +95,8 @@ def _supervise(
         while not (run / "run.json").exists():
             supervisor.check()
             time.sleep(0.05)
+        cores, config = os.cpu_count() or 2, _config(run)
+        count = actors or max(1, cores - learner_threads(config.learner.threads, cores))
         join = ["--connect", address]
         serve = ["curriculum", "serve", "--run", str(run), *join]
         supervisor.add(Child("curriculum", lambda: serve, run / "logs" / "curriculum.log"))
@@ -150,8 +150,12 @@ class _Clock:
         self._life = life
 
 
+def _config(run: Path) -> Config:
+    return parse((run / "config.toml").read_text("utf-8"))
+
+
 def _summary(run: Path, load: float) -> dict[str, Any]:
-    config = parse((run / "config.toml").read_text("utf-8"))
+    config = _config(run)
     learned = json.loads((run / "summary.json").read_text("utf-8"))
     return {
         "run": run.resolve().name,
