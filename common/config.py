@@ -121,6 +121,8 @@ class ReplayConfig(Section):
     """Environment steps over which b goes from b_0 to b_1."""
     warmup_steps: Count = 2_000
     """Transitions stored before the first update."""
+    draw_ahead: Annotated[int, Field(ge=1, le=64)] = 4
+    """Batches drawn at one go, which is cheaper; new priorities and episodes count from the next draw on."""
     samples_per_insert: Positive = 64.0
     """Transitions sampled per transition stored after the warm-up: with batches of 128, an update per two."""
     error_buffer: Positive = 10_000.0

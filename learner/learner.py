@@ -13,7 +13,7 @@ from common.config import Config
 from common.errors import RunError
 from common.messages import Episode
 from common.observation import ObservationLayout
-from learner.replay.buffer import Replay
+from learner.replay.buffer import Batch, Replay
 from learner.replay.limiter import RateLimiter
 from learner.sac import SAC, Losses
 
@@ -29,6 +29,7 @@ class Learner:
         self.limiter = RateLimiter(config.replay, config.sac.batch_size, steps)
         self.replay = Replay(config.replay, self.layout, steps, self._rng)
         self.sac = SAC(config)
+        self._drawn: list[Batch] = []
 
     def insert(self, episode: Episode, first_step: int, restored: bool = False) -> None:
         """Stores an episode, whose first transition is the run's `first_step`.
@@ -48,15 +49,11 @@ class Learner:
         """
         if not self.limiter.may_sample():
             return None
-        config = self.config
-        done = min(1.0, env_steps / config.replay.importance_steps)
-        start, end = config.replay.importance_start, config.replay.importance_end
-        batch = self.replay.sample(
-            config.sac.batch_size, config.sac.n_step, config.sac.gamma, start + done * (end - start)
-        )
+        batch = self._next_batch(env_steps)
         self.limiter.sample()
-        uniform = config.sac.actor_batch == "uniform" and self.sac.policy_due
-        others = self.replay.sample_uniformly(config.sac.batch_size) if uniform else None
+        sac = self.config.sac
+        uniform = sac.actor_batch == "uniform" and self.sac.policy_due
+        others = self.replay.sample_uniformly(sac.batch_size) if uniform else None
         losses, errors = self.sac.update(batch, others)
         if not (math.isfinite(losses.critic) and math.isfinite(losses.alpha)):
             raise RunError(
@@ -66,8 +63,17 @@ class Learner:
         self.replay.update_priorities(batch, errors)
         return losses
 
+    def _next_batch(self, env_steps: int) -> Batch:
+        if not self._drawn:
+            replay, sac = self.config.replay, self.config.sac
+            done = min(1.0, env_steps / replay.importance_steps)
+            b = replay.importance_start + done * (replay.importance_end - replay.importance_start)
+            self._drawn = self.replay.sample_many(replay.draw_ahead, sac.batch_size, sac.n_step, sac.gamma, b)
+        return self._drawn.pop(0)
+
     def save(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
-        """Groups of tensors, and what goes into JSON."""
+        """Groups of tensors, and what goes into JSON; batches drawn ahead are not kept, here or there."""
+        self._drawn.clear()
         networks, moments = self.sac.state()
         steps, weights = self.replay.priorities()
         priorities = {"steps": torch.from_numpy(steps), "weights": torch.from_numpy(weights)}

@@ -152,18 +152,65 @@ def test_priorities_of_what_was_sampled_are_the_td_errors_and_no_others_change(m
 
 def test_importance_exponent_goes_from_its_first_to_its_last_value_and_stays_there(monkeypatch):
     config = settings(
-        "replay.importance_start=0.4", "replay.importance_end=0.6", "replay.importance_steps=1000"
+        "replay.importance_start=0.4",
+        "replay.importance_end=0.6",
+        "replay.importance_steps=1000",
+        "replay.draw_ahead=1",
     )
     learner = Learner(config)
     for episode, first in episodes_of(config, [20, 20]):
         learner.insert(episode, first)
-    asked: list[tuple[int, int, float, float]] = []
-    original = learner.replay.sample
-    monkeypatch.setattr(learner.replay, "sample", lambda *given: (asked.append(given), original(*given))[1])
+    asked = watch_draws(monkeypatch, learner)
     for env_steps in (0, 250, 999, 1000, 10**9):
         assert learner.update(env_steps) is not None
-    assert {given[:3] for given in asked} == {(16, config.sac.n_step, config.sac.gamma)}
-    assert [given[3] for given in asked] == pytest.approx([0.4, 0.45, 0.5998, 0.6, 0.6])
+    assert {given[:4] for given in asked} == {(1, 16, config.sac.n_step, config.sac.gamma)}
+    assert [given[4] for given in asked] == pytest.approx([0.4, 0.45, 0.5998, 0.6, 0.6])
+
+
+def watch_draws(monkeypatch, learner: Learner) -> list[tuple[int, int, int, float, float]]:
+    """What the learner asks its replay for, from now on."""
+    asked: list[tuple[int, int, int, float, float]] = []
+    original = learner.replay.sample_many
+    monkeypatch.setattr(
+        learner.replay, "sample_many", lambda *given: (asked.append(given), original(*given))[1]
+    )
+    return asked
+
+
+def test_batches_are_drawn_some_at_one_go_and_none_is_kept_in_a_checkpoint(monkeypatch):
+    learner = Learner(settings("replay.draw_ahead=3", "replay.error_buffer=200"))
+    for episode, first in episodes_of(learner.config, [20, 20]):
+        learner.insert(episode, first)
+    asked = watch_draws(monkeypatch, learner)
+    for draws in (1, 1, 1, 2, 2):
+        assert learner.update(0) is not None
+        assert [given[0] for given in asked] == [3] * draws
+    learner.save()
+    assert learner.update(0) is not None
+    assert len(asked) == 3
+
+
+def test_batches_drawn_at_one_go_are_each_stratified_and_normalised_by_themselves():
+    learner, errors = unequal()
+    total = sum((error + 1e-6) ** 0.6 for error in errors.values())
+    ends = dict(zip(errors, np.cumsum([(e + 1e-6) ** 0.6 for e in errors.values()]) / total, strict=True))
+    seen = []
+    for _ in range(100):
+        batches = learner.replay.sample_many(4, 8, 1, 0.9, 0.5)
+        assert len(batches) == 4
+        for batch in batches:
+            assert len(batch.steps) == len(batch.reward) == len(batch.next_observation.lidar) == 8
+            assert batch.weight.max() == 1.0
+            expected = np.array([(errors[step] + 1e-6) ** -0.3 for step in batch.steps.tolist()])
+            np.testing.assert_allclose(batch.weight, expected / expected.max(), rtol=1e-5)
+            assert batch.observation.lidar[:, 0].tolist() == batch.steps.tolist()
+            # of eight equal shares of all that can be drawn, each gave one
+            for share, step in enumerate(batch.steps.tolist()):
+                power = (errors[step] + 1e-6) ** 0.6 / total
+                assert ends[step] > share / 8 - 1e-9
+                assert ends[step] - power < (share + 1) / 8 + 1e-9
+        seen.append([batch.steps.tolist() for batch in batches])
+    assert all(a != b for a, b, *_ in seen)
 
 
 @pytest.mark.parametrize(("kind", "due"), [("critic", []), ("uniform", [0, 3, 6])])
@@ -337,7 +384,7 @@ def test_save_that_lacks_something_is_refused(group):
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_losses_that_are_no_numbers_end_the_run_and_leave_the_priorities(value):
-    config = settings()
+    config = settings("replay.draw_ahead=1")
     learner = Learner(config)
     for episode, first in episodes_of(config, [20, 20]):
         learner.insert(episode, first)

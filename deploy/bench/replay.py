@@ -20,8 +20,8 @@ from learner.replay.buffer import Batch, Replay
 
 CHUNK = 8192
 """Transitions that a rival is given at a time while it is filled."""
-Cycle = Callable[[np.random.Generator], None]
-"""Samples a batch, with its observations, and writes new priorities back."""
+Cycle = Callable[[np.random.Generator, int], None]
+"""Draws so many batches at one go, with their observations, and writes new priorities back."""
 
 
 def synthetic_episode(config: Config, steps: int, rng: np.random.Generator) -> Episode:
@@ -49,6 +49,7 @@ def bench_replay(config: Config, rounds: int, progress: Callable[[int, str], Non
 
     A cycle is: sample, gather observations, next observations, actions, rewards, discounts and importance
     weights, write the priorities back. The rivals hold each observation as one row, stacked beforehand.
+    All draw one batch at a time, and as many at one go as the learner does; the faster way counts.
     """
     report, rng = Report("replay"), np.random.default_rng(config.seed)
     learner = Learner(config)
@@ -73,20 +74,26 @@ def bench_replay(config: Config, rounds: int, progress: Callable[[int, str], Non
             report.skipped.append(f"{name}: {error}; pip install 'navaclq[bench]'")
         except RuntimeError as error:  # TorchRL's own word for an extension that was built for another torch
             report.skipped.append(f"{name}: {error}")
-    times: dict[str, list[float]] = {name: [] for name in (*cycles, "update")}
+    ahead = config.replay.draw_ahead
+    times: dict[tuple[str, int], list[float]] = {(name, n): [] for name in cycles for n in {1, ahead}}
+    updates: list[float] = []
     torch.set_num_threads(1)
     for i in range(rounds):
-        for name, cycle in cycles.items():
-            times[name].append(_time(cycle, rng, repeat=20))
-        times["update"].append(_time(learner.sac.update, _sample(learner)))
+        for (name, batches), seconds in times.items():
+            seconds.append(_time(cycles[name], rng, batches, repeat=20) / batches)
+        updates.append(_time(learner.sac.update, _sample(learner, 1)[0]))
         progress(i + 1, "")
-    for name, seconds in times.items():
-        report.add(f"{name}: {'SAC update' if name == 'update' else 'cycle'}", 1e3 * median(seconds), "ms")
-    peers = [times[name] for name in ("cpprb", "torchrl") if name in times]
-    if peers:
-        best = [min(values) for values in zip(*peers, strict=True)]
-        report.compare("over_best_peer", best, times["navaclq"])
-    report.compare("update_over_replay_cost", times["update"], times["navaclq"])
+    for (name, batches), seconds in times.items():
+        report.add(f"{name}: cycle, {batches} at one go", 1e3 * median(seconds), "ms per batch")
+    report.add("navaclq: SAC update", 1e3 * median(updates), "ms")
+
+    def fastest(*names: str) -> list[float]:
+        return [min(values) for values in zip(*(times[key] for key in times if key[0] in names), strict=True)]
+
+    ours = fastest("navaclq")
+    if len(cycles) > 1:
+        report.compare("over_best_peer", fastest("cpprb", "torchrl"), ours)
+    report.compare("update_over_replay_cost", updates, ours)
     return report
 
 
@@ -97,17 +104,17 @@ def _time(work: Callable[..., object], *arguments: object, repeat: int = 1) -> f
     return (time.perf_counter() - began) / repeat
 
 
-def _sample(learner: Learner) -> Batch:
+def _sample(learner: Learner, batches: int) -> list[Batch]:
     sac = learner.config.sac
-    return learner.replay.sample(
-        sac.batch_size, sac.n_step, sac.gamma, learner.config.replay.importance_start
+    return learner.replay.sample_many(
+        batches, sac.batch_size, sac.n_step, sac.gamma, learner.config.replay.importance_start
     )
 
 
 def _ours(learner: Learner) -> Cycle:
-    def cycle(rng: np.random.Generator) -> None:
-        batch = _sample(learner)
-        learner.replay.update_priorities(batch, rng.random(len(batch.rows)))
+    def cycle(rng: np.random.Generator, batches: int) -> None:
+        for batch in _sample(learner, batches):
+            learner.replay.update_priorities(batch, rng.random(len(batch.rows)))
 
     return cycle
 
@@ -141,9 +148,10 @@ def _cpprb(config: Config, learner: Learner) -> Cycle:
     for chunk in _chunks(learner):
         buffer.add(**chunk)
 
-    def cycle(rng: np.random.Generator) -> None:
-        batch = buffer.sample(config.sac.batch_size, beta=config.replay.importance_start)
-        buffer.update_priorities(batch["indexes"], rng.random(config.sac.batch_size))
+    def cycle(rng: np.random.Generator, batches: int) -> None:
+        size = batches * config.sac.batch_size
+        batch = buffer.sample(size, beta=config.replay.importance_start)
+        buffer.update_priorities(batch["indexes"], rng.random(size))
 
     return cycle
 
@@ -163,9 +171,10 @@ def _torchrl(config: Config, learner: Learner) -> Cycle:
         tensors = {name: torch.from_numpy(np.ascontiguousarray(part)) for name, part in chunk.items()}
         buffer.extend(TensorDict(tensors, batch_size=len(chunk["obs"])))
 
-    def cycle(rng: np.random.Generator) -> None:
-        batch = buffer.sample()
-        batch["td_error"] = torch.from_numpy(rng.random(config.sac.batch_size))
+    def cycle(rng: np.random.Generator, batches: int) -> None:
+        size = batches * config.sac.batch_size
+        batch = buffer.sample(size)
+        batch["td_error"] = torch.from_numpy(rng.random(size))
         buffer.update_tensordict_priority(batch)
 
     return cycle

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,11 @@ class Batch(NamedTuple):
     rows: NDArray[np.int64]
     steps: NDArray[np.int64]
     """The run's step that each row held when it was sampled: a late priority for another one is ignored."""
+
+    def part(self, rows: slice) -> Batch:
+        """Some of them."""
+        parts: list[Any] = [part.part(rows) if isinstance(part, Observation) else part[rows] for part in self]
+        return Batch(*parts)
 
 
 class Replay:
@@ -122,10 +127,19 @@ class Replay:
 
     def sample(self, size: int, n_step: int, gamma: float, importance: float) -> Batch:
         """A stratified batch; `importance` is the exponent b."""
-        strata = (np.arange(size) + self._rng.random(size)) / size
+        return self.sample_many(1, size, n_step, gamma, importance)[0]
+
+    def sample_many(
+        self, batches: int, size: int, n_step: int, gamma: float, importance: float
+    ) -> list[Batch]:
+        """Stratified batches, each normalised by itself, drawn at one go with the priorities of now."""
+        drawn = batches * size
+        strata = (np.arange(drawn) + self._rng.random(drawn)) / drawn
         total = self._tree.total
-        rows = self._tree.find(strata * total)
-        weight = (self.transitions / total * self._tree.get(rows)) ** -importance
+        # neighbouring strata go to different batches, so that each of them is stratified
+        rows = self._tree.find(strata * total).reshape(size, batches).T.ravel()
+        weight = (self.transitions / total * self._tree.get(rows).reshape(batches, size)) ** -importance
+        weight /= weight.max(axis=1, keepdims=True)
         first, last = self._first.take(rows), self._last.take(rows)
         following = np.minimum(rows + n_step, last)
         ended = (following == last) & self._terminated.take(rows)
@@ -135,16 +149,17 @@ class Replay:
         both = observe(
             self.columns, np.concatenate([rows, following]), np.concatenate([first, first]), self._layout
         )
-        return Batch(
-            observation=both.part(slice(size)),
+        whole = Batch(
+            observation=both.part(slice(drawn)),
             action=self.columns.action.take(rows, axis=0),
             reward=(rewards @ powers[:n_step]).astype(np.float32),
             discount=np.where(ended, 0.0, powers.take(following - rows)).astype(np.float32),
-            next_observation=both.part(slice(size, None)),
-            weight=(weight / weight.max()).astype(np.float32),
+            next_observation=both.part(slice(drawn, None)),
+            weight=weight.astype(np.float32).ravel(),
             rows=rows,
             steps=self._step.take(rows),
         )
+        return [whole.part(slice(start, start + size)) for start in range(0, drawn, size)]
 
     def sample_uniformly(self, size: int) -> Observation:
         """Observations of transitions that are all equally likely, whatever their priorities."""

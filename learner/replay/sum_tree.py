@@ -61,7 +61,10 @@ class SumTree:
 
     def find(self, prefixes: NDArray[np.float64]) -> NDArray[np.int64]:
         """For each prefix in [0, total) the leaf i with sum(weights[:i]) <= prefix < sum(weights[:i + 1])."""
-        found, rest = _descend(self._blocks, np.zeros(1, np.int64), prefixes)
+        edges = self._blocks[0].cumsum()
+        rest = np.minimum(prefixes, np.nextafter(edges[-1], -1.0))
+        found: NDArray[np.int64] = edges.searchsorted(rest, side="right")
+        rest -= edges.take(found) - self._blocks[0].take(found)
         for level in (self._nodes, self._leaves):
             found, rest = _descend(level, found, rest)
         return found
@@ -70,16 +73,14 @@ class SumTree:
 def _descend(
     level: NDArray[np.float64], nodes: NDArray[np.int64], rest: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The children of `nodes`, (B,) or one for all, that hold prefixes `rest` (B,), and what is left then.
+    """The children of `nodes` (B,) that hold prefixes `rest` (B,), and what is left then.
 
-    All children stand in one row of running sums, so that a single search finds each prefix within its own
-    node. Rounding must not lead it out of there, or to a child without weight.
+    That is the first child whose running sum is larger. Rounding must not lead out of the node, or to a child
+    without weight: a prefix stays below the node's sum as its children give it.
     """
-    weights = level.take(nodes, axis=0).reshape(-1)
-    edges = weights.cumsum()
-    ends = edges[level.shape[1] - 1 :: level.shape[1]]
-    starts = np.concatenate([[0.0], ends[:-1]])
-    inside = np.minimum(np.maximum(starts + rest, starts), np.nextafter(ends, -1.0))
-    places = edges.searchsorted(inside, side="right")
-    before = np.arange(len(nodes)) * level.shape[1]
-    return nodes * level.shape[1] + places - before, inside - (edges.take(places) - weights.take(places))
+    weights = level.take(nodes, axis=0)
+    edges = weights.cumsum(axis=1)
+    rest = np.minimum(rest, np.nextafter(edges[:, -1], -1.0))
+    places = (edges <= rest[:, None]).argmin(axis=1)
+    chosen = np.arange(len(nodes)) * FAN + places
+    return nodes * FAN + places, rest - (edges.take(chosen) - weights.take(chosen))
