@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import zenoh
 from hypothesis import HealthCheck, settings
 
 from common.bus import open_client, open_hub
+from tests.crew import Crew
 from tests.helpers import free_endpoint
 
 settings.register_profile(
@@ -35,6 +37,14 @@ def client(endpoint: str, hub: zenoh.Session) -> Iterator[zenoh.Session]:
     """A client of `hub`."""
     with open_client(endpoint, patience=10.0) as session:
         yield session
+
+
+@pytest.fixture
+def crew(tmp_path: Path) -> Iterator[Crew]:
+    """A system whose processes a test starts, kills and stops."""
+    found = Crew(tmp_path)
+    yield found
+    found.close()
 
 
 @pytest.fixture(scope="module")

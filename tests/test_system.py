@@ -15,40 +15,8 @@ from common.contract import fetch_contract
 from common.delivery import pack_header
 from common.messages import Origin, encode
 from deploy.screen import Monitor
+from tests.crew import SMOKE, Processes
 from tests.helpers import free_endpoint, tiny_episode, wait_until
-
-SMOKE = ["--preset", "smoke", "--set", "actor.worlds=2"]
-
-
-class Processes:
-    """Commands of navaclq in the background, their output in files, ended with the test."""
-
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self.running: dict[str, subprocess.Popen] = {}
-
-    def start(self, name: str, *arguments) -> subprocess.Popen:
-        with (self.folder / f"{name}.txt").open("ab") as output:
-            self.running[name] = subprocess.Popen(
-                [sys.executable, "-m", "deploy.cli.main", *map(str, arguments)],
-                stdout=output,
-                stderr=output,
-                start_new_session=True,
-            )
-        return self.running[name]
-
-    def words(self, name: str) -> str:
-        return (self.folder / f"{name}.txt").read_text()
-
-    def stop(self, name: str, timeout: float = 15.0) -> int:
-        self.running[name].send_signal(signal.SIGTERM)
-        return self.running[name].wait(timeout)
-
-    def close(self) -> None:
-        for process in self.running.values():
-            if process.poll() is None:
-                process.kill()
-            process.wait()
 
 
 @pytest.fixture

@@ -23,11 +23,8 @@ UPDATES = 10
 TRANSITIONS = 20_000
 
 
-def bench_learner(config: Config, rounds: int, soak: int, progress: Callable[[int, str], None]) -> Report:
+def bench_learner(config: Config, rounds: int, progress: Callable[[int, str], None]) -> Report:
     """Times whole updates, sampling and priorities included; rivals, limit and thread counts take turns.
-
-    Then `soak` updates of small networks, with a replay that overwrites itself all the time, show how much
-    memory grows.
 
     `config` must ask for what stable-baselines3 computes: no LayerNorm, no branches, no policy delay.
     """
@@ -57,15 +54,14 @@ def bench_learner(config: Config, rounds: int, soak: int, progress: Callable[[in
             report.compare(f"over_sb3{suffix}", theirs, ours)
             report.compare(f"sb3_{of_limit}", limit, theirs)
         report.compare(of_limit, limit, ours)
-    if soak:
-        report.add(f"rss_growth_over_{soak}_updates", _soak(config, soak), "MB")
-    else:
-        report.skipped.append("growth of memory: ask for it with --soak UPDATES")
     return report
 
 
-def _soak(config: Config, updates: int) -> float:
-    """MB by which memory grows over so many updates, after a tenth as many to warm up."""
+def soak_learner(config: Config, updates: int, progress: Callable[[int, str], None]) -> float:
+    """MB by which memory grows over so many updates, after a tenth as many to warm up.
+
+    The networks are small, the replay overwrites itself all the time, and checkpoints are taken.
+    """
     small = ("network.hidden=[32, 32]", "replay.capacity=20000", "replay.warmup_steps=1000")
     learner = Learner(override(config.model_dump(mode="json"), small))
     rng, steps, done, first = np.random.default_rng(config.seed), 25, 0, 0
@@ -77,6 +73,7 @@ def _soak(config: Config, updates: int) -> float:
             done += 1
             if done % 1000 == 0:
                 learner.save()
+                progress(min(done, updates), "")
             if done == updates // 10:
                 before = rss()
     return rss() - before

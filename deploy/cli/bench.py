@@ -61,10 +61,15 @@ def learner(
     """SAC updates per second, batches of 256, against stable-baselines3 and the matrix products alone."""
     alike = ["sac.batch_size=256", "sac.policy_delay=1", "sac.n_step=1", "network.layer_norm=false"]
     resolved = options.configuration("fast", None, None, alike, seed)
-    from deploy.bench.learner import bench_learner
+    from deploy.bench.learner import bench_learner, soak_learner
 
     with options.progress("rounds", rounds) as done:
-        report = bench_learner(resolved, rounds, soak, done)
+        report = bench_learner(resolved, rounds, done)
+    if soak:
+        with options.progress("updates", soak) as done:
+            report.add(f"rss_growth_over_{soak}_updates", soak_learner(resolved, soak, done), "MB")
+    else:
+        report.skipped.append("growth of memory: ask for it with --soak UPDATES")
     _print(report, as_json)
 
 
