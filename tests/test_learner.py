@@ -437,6 +437,16 @@ def unequal(*overrides: str) -> tuple[Learner, dict[int, float]]:
     return learner, dict(zip(steps.tolist(), errors.tolist(), strict=True))
 
 
+@pytest.mark.parametrize("batch", range(3))
+def test_every_one_of_batches_drawn_at_one_go_draws_in_proportion_to_the_priorities(batch):
+    learner, errors = unequal()
+    powers = {step: (error + 1e-6) ** 0.6 for step, error in errors.items()}
+    counts: Counter[int] = Counter()
+    for _ in range(3000):
+        counts.update(learner.replay.sample_many(3, 4, 1, 0.9, 0.4)[batch].steps.tolist())
+    assert chi_square(counts, {step: power / sum(powers.values()) for step, power in powers.items()}) < 3.5
+
+
 @pytest.mark.parametrize(("size", "times"), [(1, 12_000), (16, 1000)])
 def test_transitions_are_sampled_in_proportion_to_their_priorities(size, times):
     learner, errors = unequal()

@@ -50,6 +50,24 @@ def test_leaf_of_weight_zero_is_never_found_even_when_a_prefix_is_rounded_up_to_
     assert (tree.get(tree.find(prefixes)) > 0).all()
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_leaf_of_weight_zero_is_never_found_at_the_edges_of_any_other(seed):
+    rng = np.random.default_rng(seed)
+    weights = rng.random(700) * 10.0 ** rng.integers(-6, 2, 700) * (rng.random(700) < rng.choice([0.02, 0.5]))
+    tree, edges = tree_of(weights.tolist()), np.cumsum(weights)
+    near = [np.nextafter(edges, -1), edges, np.nextafter(edges, 1e9)]
+    found = tree.find(np.sort(np.concatenate(near)))
+    assert (tree.get(found) > 0).all()
+    assert (np.diff(found) >= 0).all()
+
+
+def test_rounding_between_levels_does_not_lead_to_an_empty_leaf():
+    """What the first block gives back of this prefix is less than nothing."""
+    tree = SumTree(512)
+    tree.set(np.array([0, 257]), np.array([0.4858353588317891, 0.8894878343490003]))
+    assert tree.find(np.array([0.4858353588317891])).tolist() == [257]
+
+
 def test_last_leaves_of_weight_zero_are_passed_over_at_the_total():
     tree = tree_of([0.0, 1.0, 2.0, 0.0, 0.0])
     assert tree.find(np.array([0.0, 0.999, 1.0, 3.0, 3.5])).tolist() == [1, 1, 2, 2, 2]

@@ -136,8 +136,8 @@ class Replay:
         drawn = batches * size
         strata = (np.arange(drawn) + self._rng.random(drawn)) / drawn
         total = self._tree.total
-        # neighbouring strata go to different batches, so that each of them is stratified
-        rows = self._tree.find(strata * total).reshape(size, batches).T.ravel()
+        # neighbouring strata go to different batches, by lot: each batch is stratified, and draws from all
+        rows = self._rng.permuted(self._tree.find(strata * total).reshape(size, batches), axis=1).T.ravel()
         weight = (self.transitions / total * self._tree.get(rows).reshape(batches, size)) ** -importance
         weight /= weight.max(axis=1, keepdims=True)
         first, last = self._first.take(rows), self._last.take(rows)

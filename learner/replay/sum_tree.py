@@ -76,11 +76,11 @@ def _descend(
     """The children of `nodes` (B,) that hold prefixes `rest` (B,), and what is left then.
 
     That is the first child whose running sum is larger. Rounding must not lead out of the node, or to a child
-    without weight: a prefix stays below the node's sum as its children give it.
+    without weight: a prefix stays within the node's sum as its children give it.
     """
     weights = level.take(nodes, axis=0)
     edges = weights.cumsum(axis=1)
-    rest = np.minimum(rest, np.nextafter(edges[:, -1], -1.0))
+    rest = np.minimum(np.maximum(rest, 0.0), np.nextafter(edges[:, -1], -1.0))
     places = (edges <= rest[:, None]).argmin(axis=1)
     chosen = np.arange(len(nodes)) * FAN + places
     return nodes * FAN + places, rest - (edges.take(chosen) - weights.take(chosen))
