@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from actor.inference import Actor, Eyes
 from actor.world.world import DockingWorld, Sensed
 from common.config import Config
-from common.messages import Candidate, Ending, Episode, Version
+from common.messages import Candidate, Category, Ending, Episode, Version
 from common.observation import ACTION_SIZE, HISTORY, Columns, ObservationLayout, observe
 from common.tasks import Task
 
@@ -24,7 +24,7 @@ class Finished:
     columns: Columns
     ending: Ending
 
-    def message(self, digest: dict[str, str], first: Version, last: Version, category: str) -> Episode:
+    def message(self, digest: dict[str, str], first: Version, last: Version, category: Category) -> Episode:
         """What is sent to the learner; `first` and `last` version of the weights that drove."""
         return Episode(
             digest=digest,

@@ -24,6 +24,9 @@ MEGABYTE = 2**20
 Ending = Literal["success", "dolly_contact", "other_contact", "timeout"]
 ENDINGS: tuple[Ending, ...] = ("success", "dolly_contact", "other_contact", "timeout")
 Requested = Literal["easy", "frontier", "random"]
+Category = Literal["easy", "frontier", "random", "gate", "rnd", "unserved"]
+"""Why a task was proposed: what was requested, `random` too when n_T draws met nothing, `gate` while the gate
+is closed, `rnd` without curriculum; `unserved` when the curriculum did not answer."""
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
 CellIndex = Annotated[int, Field(ge=0, lt=len(CELLS))]
 NonNegative = Annotated[int, Field(ge=0)]
@@ -114,8 +117,7 @@ class Episode(Message):
     ending: Ending
     first_version: Version
     last_version: Version
-    category: Annotated[str, Field(max_length=32)]
-    """Why the task was proposed: the curriculum's category, or `unserved` without an answer from it."""
+    category: Category
 
     @property
     def length(self) -> int:
@@ -131,8 +133,8 @@ class Episode(Message):
         """The rows."""
         return Columns(self.visual, self.lidar, self.action, self.reward)
 
-    def check_layout(self, layout: ObservationLayout, max_steps: int) -> None:
-        """Raises MessageError unless the rows are those of the layout."""
+    def check_layout(self, layout: ObservationLayout, max_steps: int, largest_reward: float) -> None:
+        """Raises MessageError unless the rows are those of the layout, and their numbers possible ones."""
         rows = len(self.reward)
         if not 2 <= rows <= max_steps + 1:
             raise MessageError(f"episode of {rows - 1} steps; 1 to {max_steps} are possible")
@@ -146,6 +148,10 @@ class Episode(Message):
             _check_array(name, getattr(self, name), shape, dtype)
         if np.abs(self.action).max() > 1.0:
             raise MessageError("action outside [-1, 1]")
+        if self.lidar.min() < 0.0 or self.lidar.max() > 1.0:
+            raise MessageError("lidar outside [0, 1]")
+        if np.abs(self.reward).max() > largest_reward * 1.001:  # the sum of its terms, in float32
+            raise MessageError(f"reward larger than {largest_reward:g}, the most of the world's terms")
 
 
 class Frames(Message):
@@ -188,8 +194,7 @@ class Proposal(Message):
     id: Name
     task: TrainingTask
     requested: Requested
-    category: Annotated[str, Field(max_length=32)]
-    """What was found: the requested type, `random` when n_T draws met nothing, `gate`, `rnd`."""
+    category: Category
     properties: GeometricProperties
     q: float | None
     q_reason: str
@@ -215,7 +220,7 @@ class Outcome(Message):
     properties: GeometricProperties
     q: float | None
     success: bool
-    category: Annotated[str, Field(max_length=32)]
+    category: Category
 
 
 class Candidate(Message):

@@ -130,6 +130,12 @@ class RewardConfig(Section):
     success_distance: Positive = 0.3
     """Distance of the centres that counts as docked, m."""
 
+    @property
+    def largest(self) -> float:
+        """No step's reward is farther from 0."""
+        endings = self.dolly_contact, self.other_contact, self.success
+        return abs(self.step) + abs(self.slow) + max(map(abs, endings))
+
 
 class ObstacleConfig(Section):
     """Boxes left and right of the dolly (appendix B: number and distance; the rest decided)."""

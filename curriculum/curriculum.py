@@ -12,7 +12,7 @@ import numpy as np
 from common.config import Config
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
-from common.messages import Candidates, Outcome, Proposal, Requested
+from common.messages import Candidates, Category, Outcome, Proposal, Requested
 from common.policy_files import finish_saving, load_tensors, save_folder
 from common.tasks import Task, candidate_task, random_task
 from common.world_config import StartRanges
@@ -86,7 +86,7 @@ class Curriculum:
             found = get_anchored_task(requested, f, mu, sigma, config, self.rng)
         else:
             found = get_dynamic_task(requested, f.tolist(), mu, sigma, config)
-        category: str = requested if found is not None else "random"
+        category: Category = requested if found is not None else "random"
         index = int(self.rng.integers(len(draws))) if found is None else found
         self.store.remove(draws[index])
         return self._proposal(draws[index], requested, category, float(f[index]), mu, sigma)
@@ -110,7 +110,7 @@ class Curriculum:
         self,
         entry: Entry,
         requested: Requested,
-        category: str,
+        category: Category,
         f: float | None = None,
         mu: float | None = None,
         sigma: float | None = None,

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from typing import get_args
 
 import msgpack
 import numpy as np
@@ -27,6 +28,7 @@ LAYOUT = ObservationLayout.of(CONFIG)
 
 names = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
 texts = st.text(max_size=32)
+categories = st.sampled_from(get_args(m.Category))
 counts = st.integers(0, 2**63)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 digests = st.dictionaries(texts, texts, max_size=16)
@@ -53,7 +55,7 @@ proposals = st.builds(
     id=names,
     task=tasks,
     requested=st.sampled_from(["easy", "frontier", "random"]),
-    category=texts,
+    category=categories,
     properties=properties,
     q=st.none() | numbers,
     q_reason=texts,
@@ -78,7 +80,7 @@ MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
         ending=st.sampled_from(m.ENDINGS),
         first_version=versions,
         last_version=versions,
-        category=texts,
+        category=categories,
     ),
     m.Frames: st.builds(m.Frames, digest=digests, task=tasks, frame=arrays, mask=arrays, goal=arrays),
     m.TaskQuery: st.builds(m.TaskQuery, cell=st.integers(0, 8), t=counts, count=st.integers(1, 1000)),
@@ -92,7 +94,7 @@ MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
         properties=properties,
         q=st.none() | numbers,
         success=st.booleans(),
-        category=texts,
+        category=categories,
     ),
     m.Candidate: candidates,
     m.Candidates: st.builds(m.Candidates, digest=digests, candidates=st.lists(candidates, max_size=3)),
@@ -356,7 +358,7 @@ def test_a_full_answer_to_the_largest_question_fits():
             shift=DollyShift(step=10_000, x=0.1, y=0.1, yaw=0.1),
         ),
         requested="frontier",
-        category="c" * 32,
+        category="unserved",
         properties=GeometricProperties(**dict.fromkeys(GeometricProperties.model_fields, 0.1)),
         q=0.1,
         q_reason="no weights of the critic yet",
@@ -382,7 +384,7 @@ def test_versions_compare_by_epoch_first():
 def test_well_formed_episode_fits_its_layout(preset, variant):
     config = resolve(preset, variant=variant)
     episode = decode(m.Episode, encode(tiny_episode(config, steps=20)))
-    episode.check_layout(ObservationLayout.of(config), config.world.max_episode_steps)
+    episode.check_layout(ObservationLayout.of(config), config.world.max_episode_steps, 10.15)
     assert episode.length == 20
     columns = episode.columns()
     assert all(len(part) == 21 for part in columns.parts())
@@ -398,10 +400,28 @@ def test_only_a_timeout_is_a_truncation():
     }
 
 
-def outside(episode: m.Episode) -> dict:
-    action = episode.action.copy()
-    action[0, 1] = 1.0001
-    return {"action": action}
+def changed(name: str, number: float) -> Callable[[m.Episode], dict]:
+    """One number of a column replaced."""
+
+    def change(episode: m.Episode) -> dict:
+        column = getattr(episode, name).copy()
+        column.flat[1] = number
+        return {name: column}
+
+    return change
+
+
+def test_numbers_at_their_limits_are_taken():
+    for name, number in (
+        ("action", -1.0),
+        ("lidar", 0.0),
+        ("lidar", 1.0),
+        ("reward", 10.15),
+        ("reward", -10.15),
+    ):
+        episode = tiny_episode(CONFIG)
+        at_limit = episode.model_copy(update=changed(name, number)(episode))
+        at_limit.check_layout(LAYOUT, 20, CONFIG.world.reward.largest)
 
 
 @pytest.mark.parametrize(
@@ -417,14 +437,18 @@ def outside(episode: m.Episode) -> dict:
         (lambda e: {"reward": e.reward[:1]}, "episode of 0 steps; 1 to 20 are possible"),
         (lambda e: {"reward": e.reward[:0]}, "1 to 20 are possible"),
         (lambda e: {"reward": np.zeros(22, np.float32)}, "episode of 21 steps; 1 to 20 are possible"),
-        (outside, r"action outside \[-1, 1\]"),
+        (changed("action", 1.0001), r"action outside \[-1, 1\]"),
+        (changed("lidar", 1.01), r"lidar outside \[0, 1\]"),
+        (changed("lidar", -0.01), r"lidar outside \[0, 1\]"),
+        (changed("reward", 10.3), "reward larger than 10.15"),
+        (changed("reward", -3e38), "reward larger than 10.15"),
     ],
 )
 def test_episode_that_does_not_fit_the_layout_is_refused(change: Callable, said):
     episode = tiny_episode(CONFIG)
     broken = decode(m.Episode, encode(episode.model_copy(update=change(episode))))
     with pytest.raises(MessageError, match=said):
-        broken.check_layout(LAYOUT, 20)
+        broken.check_layout(LAYOUT, 20, 10.15)
 
 
 def sample_proposals() -> m.Proposals:
@@ -457,7 +481,7 @@ def survives(kind: type[m.Message], data: bytes) -> bool:
     try:
         message = decode(kind, data)
         if isinstance(message, m.Episode):
-            message.check_layout(LAYOUT, 20)
+            message.check_layout(LAYOUT, 20, 10.15)
     except MessageError as error:
         assert 0 < len(str(error)) < 400
         str(error).encode()
