@@ -15,7 +15,8 @@ from typing import NamedTuple
 import msgpack
 
 from common.delivery import DuplicateFilter
-from common.files import sync_folder, write_atomically
+from common.errors import UsageError
+from common.files import sync, write_atomically
 from common.messages import Episode, Origin
 
 log = logging.getLogger(__name__)
@@ -48,26 +49,31 @@ class EpisodeLog:
         self.seen = DuplicateFilter()
         self.env_steps = self.episodes = 0
         self._folder, self._capacity, self._segment_bytes = folder, capacity, segment_bytes
-        self._sync, self._unsynced = sync, False
+        self._sync = self._unsynced = sync  # a former life may have ended between an append and its commit
         self.broken: OSError | None = None
         """Why the disk may lack what was appended: nothing can be written or committed after that."""
         self._sizes: deque[tuple[Path, int]] = deque()
         """Closed segments, oldest first, with the transitions that each holds."""
         self._current = 0
         folder.mkdir(parents=True, exist_ok=True)
-        self._number = max((int(path.stem) for path in folder.glob("*.log")), default=0)
+        self._number = max((int(path.stem) for path in self._segments()), default=0)
         self._file = None if self._number == 0 else self._path().open("ab", buffering=0)
 
     def restore(self) -> Iterator[Record]:
         """All whole records, oldest first; skips damage, cuts a torn tail, and says so.
 
-        Exhaust it before the first append.
+        Exhaust it before the first append. Raises UsageError for a file that cannot be read at all.
         """
         saved = self._folder / "seen.json"
         if saved.exists():
-            self.seen.restore(json.loads(saved.read_text()))
-        paths = sorted(self._folder.glob("*.log"))
-        for path in paths:
+            try:
+                self.seen.restore(json.loads(saved.read_text()))
+            except (OSError, ValueError, TypeError) as error:
+                raise UsageError(
+                    f"{saved} is damaged ({error}); without it the run goes on, but an episode that was "
+                    "dropped from the log long ago and is sent again would count twice"
+                ) from None
+        for path in self._segments():
             transitions = 0
             for record in self._read(path):
                 transitions += record.length
@@ -125,6 +131,9 @@ class EpisodeLog:
         if self._file is not None:
             self._file.close()
 
+    def _segments(self) -> list[Path]:
+        return sorted(path for path in self._folder.glob("*.log") if path.stem.isdecimal())
+
     def _path(self) -> Path:
         return self._folder / f"{self._number:08d}.log"
 
@@ -145,12 +154,15 @@ class EpisodeLog:
         self._current = 0
         self._file = self._path().open("ab", buffering=0)
         if self._sync:
-            sync_folder(self._folder)
+            sync(self._folder)
 
     def _read(self, path: Path) -> Iterator[Record]:
-        whole = path.stat().st_size
-        with path.open("rb") as file:
-            data = file.read(self._segment_bytes + LARGEST)
+        try:
+            whole = path.stat().st_size
+            with path.open("rb") as file:
+                data = file.read(self._segment_bytes + LARGEST)
+        except OSError as error:
+            raise UsageError(f"cannot read {path}: {error.strerror}") from None
         position = end = 0
         while (start := data.find(MAGIC, position)) >= 0:
             body = _body(data, start)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-import socket
+import resource
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,10 @@ from common.geometry import SE2, Rectangle
 from common.messages import Ending, Episode, Version
 from common.observation import ACTION_SIZE, ObservationLayout
 from common.tasks import Task
+from deploy.launcher import free_port
 
 PATIENCE = 3.0
 """Times as long as on a quiet machine that tests wait for what must happen."""
-
-
-def free_port() -> int:
-    """A TCP port on loopback that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def free_endpoint() -> str:
@@ -42,6 +38,19 @@ def wait_until(condition: Callable[[], Any], timeout: float = 10.0, what: str = 
             raise AssertionError(f"{what} did not come true within {timeout} s")
         time.sleep(0.005)
     return value
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Lets no file of this process grow beyond `size`, as a full disk would."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def tiny_episode(

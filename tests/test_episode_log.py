@@ -2,19 +2,19 @@ import errno
 import json
 import logging
 import os
-import resource
 import shutil
-import signal
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from common.errors import UsageError
 from common.messages import Episode, Origin, decode, encode
+from learner.learner import Learner
 from learner.log import EpisodeLog, Record
-from tests.helpers import small_config, tiny_episode
+from tests.helpers import largest_file, small_config, tiny_episode
 
 CAPACITY = 1000
 
@@ -63,19 +63,6 @@ def filled(folder: Path, count: int = 3) -> Path:
         log.append(origin(seq), seq + 1, f"episode {seq}".encode())
     log.close()
     return folder / "00000001.log"
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Lets no file of this process grow beyond `size`, as a full disk would."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def test_episodes_come_back_in_order_with_the_counts_after_each(tmp_path):
@@ -300,6 +287,66 @@ def test_rotation_goes_on_after_a_restart(tmp_path):
     assert numbers == list(range(numbers[0], numbers[-1] + 1))
     assert 2 <= len(numbers) <= 5
     assert json.loads((tmp_path / "seen.json").read_text())[0][:2] == ["a1", "b1"]
+
+
+def test_replay_after_any_number_of_kills_holds_exactly_the_newest_episodes_once(tmp_path):
+    """The ring wraps around, segments are dropped, and no life ends in an orderly way."""
+    config = small_config("replay.capacity=200")
+    rng, number, expected = np.random.default_rng(3), 0, []
+    for life in range(8):
+        log, learner = EpisodeLog(tmp_path, 200, segment_bytes=4000), Learner(config)
+        for record in log.restore():
+            episode = decode(Episode, record.payload)
+            learner.insert(episode, record.env_steps - record.length, restored=True)
+        steps = learner.replay.priorities()[0].tolist()
+        assert len(steps) == len(set(steps)) == learner.replay.transitions
+        kept: list[range] = []
+        for span in reversed(expected):  # the newest that fit
+            if sum(map(len, kept)) + len(span) > 200:
+                break
+            kept.append(span)
+        assert sorted(steps) == [step for span in reversed(kept) for step in span], f"life {life}"
+        for _ in range(int(rng.integers(1, 40))):
+            episode = tiny_episode(config, int(rng.integers(1, 21)), seed=number)
+            record = log.append(origin(number), episode.length, encode(episode))
+            learner.insert(episode, record.env_steps - record.length)
+            expected.append(range(record.env_steps - record.length, record.env_steps))
+            number += 1
+    assert len(list(tmp_path.glob("*.log"))) < number / 5, "segments were dropped"
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1, 2]", '[["a", "b", "c", []]]'])
+def test_damaged_memory_of_duplicates_is_named(tmp_path, content):
+    filled(tmp_path)
+    (tmp_path / "seen.json").write_text(content)
+    with pytest.raises(UsageError, match=r"seen.json is damaged .*; without it the run goes on, but"):
+        opened(tmp_path)
+
+
+def test_files_that_are_no_segments_are_left_alone(tmp_path):
+    filled(tmp_path)
+    (tmp_path / "notes.log").write_text("mine")
+    log, records = opened(tmp_path)
+    log.append(origin(3), 1, b"more")
+    assert len(records) == 3
+    assert (tmp_path / "notes.log").read_text() == "mine"
+
+
+def test_segment_that_cannot_be_read_is_named(tmp_path):
+    filled(tmp_path)
+    (tmp_path / "00000000.log").mkdir()
+    with pytest.raises(UsageError, match=r"cannot read .*00000000.log: Is a directory"):
+        opened(tmp_path)
+
+
+def test_what_was_appended_before_a_kill_is_committed_before_a_duplicate_is_confirmed(tmp_path, syncs):
+    log, _ = opened(tmp_path)
+    log.append(origin(0), 1, b"never committed")
+    again = EpisodeLog(tmp_path, CAPACITY, sync=True)
+    assert len(list(again.restore())) == 1
+    assert again.seen.seen(origin(0))
+    again.commit()
+    assert [name for name, _ in syncs.calls] == ["00000001.log"]
 
 
 def test_append_that_fails_for_want_of_space_leaves_no_trace(tmp_path):
