@@ -2,9 +2,9 @@
 
     python benchmarks/curves.py --out docs/recipe.png default 1-step:sac.n_step=1 hard:sac.target=hard
 
-trains one run after another, seed and minutes alike, into runs/curve-NAME (nothing else should run beside),
-then examines every snapshot. What is there already is not done again. Of a single training it draws how
-the episodes ended, too. Needs matplotlib: pip install 'navaclq[plots]'.
+trains one run after another, seed and minutes alike, into runs/curve-NAME-MINUTES-SEED (nothing else should
+run beside), then examines every snapshot. What is there already is not done again. Of a single training it
+draws how the episodes ended, too. Needs matplotlib: pip install 'navaclq[plots]'.
 """
 
 from __future__ import annotations
@@ -33,8 +33,10 @@ def navaclq(*arguments: object) -> dict[str, Any]:
 def train(variant: str, folder: Path, minutes: float, seed: int) -> tuple[str, Path]:
     """The name and the run of NAME:section.key=value;..."""
     name, _, settings = variant.partition(":")
-    run = folder / f"curve-{name}"
+    run = folder / f"curve-{name}-{minutes:g}min-seed{seed}"
     if not (run / "result.json").exists():
+        if (run / "run.json").exists():
+            raise typer.BadParameter(f"{run} was interrupted; remove it, and it is trained anew")
         chosen = [f"learner.snapshot_steps={SNAPSHOT_STEPS}", *filter(None, settings.split(";"))]
         options = [part for setting in chosen for part in ("--set", setting)]
         navaclq("train", "--run", run, "--minutes", minutes, "--seed", seed, *options)
@@ -44,7 +46,9 @@ def train(variant: str, folder: Path, minutes: float, seed: int) -> tuple[str, P
 def examine(run: Path) -> Curve:
     """Summaries on suite `train` by environment steps, one for each snapshot."""
     found = {}
-    for snapshot in sorted((run / "snapshots").glob("[0-9f]*")):  # neither the untrained nor the best one
+    for snapshot in sorted((run / "snapshots").iterdir()):
+        if not (snapshot.name.isdecimal() or snapshot.name == "final"):
+            continue
         kept = run / "evaluation" / f"{snapshot.name}.json"
         if not kept.exists():
             kept.parent.mkdir(exist_ok=True)

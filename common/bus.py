@@ -164,7 +164,7 @@ class QueryServer:
         self.refused: Counter[str] = Counter()
         self._key, self._handler, self._commit = key, handler, commit
         self._inbox: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
-        self._logged = 0.0
+        self._logged, self._closed = 0.0, False
         self._thread = threading.Thread(target=self._serve, name=f"serve {key}", daemon=True)
         self._thread.start()
         self._queryable = session.declare_queryable(key, self._receive)
@@ -228,7 +228,10 @@ class QueryServer:
             query.reply_err(reason.encode())
 
     def close(self) -> None:
-        """Stops taking queries and ends the thread after those already taken."""
+        """Stops taking queries and ends the thread after those already taken; once is enough."""
+        if self._closed:
+            return
+        self._closed = True
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
         with suppress(queue.Full):  # behind a handler that is stuck; its thread, a daemon, is abandoned
             self._inbox.put(None, timeout=1.0)
@@ -352,8 +355,8 @@ class Subscription:
             log.warning("ignored a message on %s: %s", key, error)
 
 
-def announce(session: zenoh.Session, keys: Keys, role: str, name: str) -> object:
-    """Declares this process alive; keep the returned token. Raises UsageError when the name is taken."""
+def announce(session: zenoh.Session, keys: Keys, role: str, name: str) -> zenoh.LivelinessToken:
+    """Declares this process alive until the returned token is undeclared, or lost. Raises UsageError when the name is taken."""
     key = keys.live(role, name)
     if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=2.0)):
         raise UsageError(f"a {role} named {name!r} is already connected; choose another --name")

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from common.config import Config, parse
 from common.errors import UsageError
+from common.files import sync
 
 CONFIG, NETWORKS = "config.toml", "networks.safetensors"
 
@@ -26,7 +27,7 @@ def save_folder(
 ) -> None:
     """Writes files, of text or bytes, and files of tensors into a new folder by way of a temporary name.
 
-    Raises OSError when it cannot.
+    The disk has them when this returns. Raises OSError when it cannot.
     """
     part, old = _unfinished(folder)
     _finish(folder)
@@ -43,9 +44,12 @@ def save_folder(
             if number is None:
                 raise
             raise OSError(int(number[1]), os.strerror(int(number[1])), str(part / name)) from None
+    for path in (*part.iterdir(), part):
+        sync(path)
     if folder.exists():
         folder.rename(old)
     part.rename(folder)
+    sync(folder.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch import Tensor
 from common.config import Config, differing_keys, parse
 from common.encoders import ENCODER, frozen_encoder, pack_encoder
 from common.errors import UsageError
-from common.files import write_atomically
+from common.files import lock, sync, write_atomically
 from common.messages import Version
 from common.networks import Encoder, state_of
 from common.policy_files import CONFIG, NETWORKS, finish_saving, load_tensors, save_folder
@@ -58,6 +58,7 @@ class RunDirectory:
             raise UsageError(f"run name {self.name!r} may hold letters, digits, _, . and - only, at most 64")
         identity = folder / "run.json"
         self._job = job
+        self._lock: IO[bytes] | None = None
         if identity.exists():
             if source is not None:
                 raise UsageError(f"{folder} exists; to begin from {source} choose another --run")
@@ -74,8 +75,10 @@ class RunDirectory:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / STARTING).touch()
                 (folder / CONFIG).write_text(config.to_toml(), "utf-8")
+                sync(folder / CONFIG)
                 if encoder is not None:
                     (folder / ENCODER).write_bytes(pack_encoder(encoder))
+                    sync(folder / ENCODER)
                 shutil.rmtree(folder / "checkpoints", ignore_errors=True)  # of a start that was interrupted
                 if weights is not None:
                     self._write(self._checkpoint(FIRST), {NETWORKS: weights}, {"from": str(source)})
@@ -137,15 +140,30 @@ class RunDirectory:
         return score if math.isfinite(score) else -math.inf
 
     def next_epoch(self) -> int:
-        """Counts one more start of the learner, which may write from now on; never runs backwards."""
+        """Counts one more start of the learner, which may write from now on; never runs backwards.
+
+        Raises UsageError when another learner has the folder.
+        """
         identity = self.folder / "run.json"
         values = json.loads(identity.read_text("utf-8"))
         values["epoch"] += 1
         with self._writing():
+            try:
+                self._lock = self._lock or lock(self.folder / "lock")
+            except BlockingIOError:
+                raise UsageError(
+                    f"another learner trains in {self.folder}; stop it first, or choose another --run"
+                ) from None
             for name in ("checkpoints", "snapshots"):
                 finish_saving(self.folder / name)
             write_atomically(identity, json.dumps(values).encode())
         return int(values["epoch"])
+
+    def release(self) -> None:
+        """Lets another learner have the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def save(self, learner: Learner, frozen: dict[str, Tensor], epoch: int, env_steps: int) -> None:
         """A checkpoint of all that learns and of what is frozen; keeps the newest few.

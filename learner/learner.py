@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -54,8 +53,9 @@ class Learner:
         sac = self.config.sac
         uniform = sac.actor_batch == "uniform" and self.sac.policy_due
         others = self.replay.sample_uniformly(sac.batch_size) if uniform else None
+        due = self.sac.policy_due
         losses, errors = self.sac.update(batch, others)
-        if not (math.isfinite(losses.critic) and math.isfinite(losses.alpha)):
+        if not np.isfinite([losses.critic, losses.alpha, losses.policy if due else 0.0]).all():
             raise RunError(
                 f"the losses of update {self.sac.updates} are not finite ({losses}); "
                 "the last checkpoint is from before"
@@ -72,9 +72,15 @@ class Learner:
         return self._drawn.pop(0)
 
     def save(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
-        """Groups of tensors, and what goes into JSON; batches drawn ahead are not kept, here or there."""
+        """Groups of tensors, and what goes into JSON; batches drawn ahead are not kept, here or there.
+
+        Raises RunError when a network holds numbers that are none.
+        """
         self._drawn.clear()
         networks, moments = self.sac.state()
+        for name, tensor in networks.items():
+            if not tensor.isfinite().all():
+                raise RunError(f"{name} is not finite after update {self.sac.updates}; nothing was saved")
         steps, weights = self.replay.priorities()
         priorities = {"steps": torch.from_numpy(steps), "weights": torch.from_numpy(weights)}
         state = {

@@ -125,8 +125,9 @@ class SAC:
     ) -> tuple[Losses, NDArray[np.float64]]:
         """One gradient step on all that is due; returns figures and |TD error| (B,), the twins' mean.
 
-        All gradients are taken before any step, as Haarnoja et al. 2018 do in their code (algorithm 3, like
-        theirs, lists the steps in turn): what the critics make of the observations serves J_Q and J_pi alike.
+        All gradients are taken before any step; the code of Haarnoja et al. 2018 too runs its steps at once,
+        though their listing, like algorithm 3, has them in turn. What the critics' first layer makes of the
+        observations so serves J_Q and J_pi alike.
         With `actor_batch` policy and temperature learn from those observations in place of the batch's.
         """
         sac = self.config.sac
@@ -210,7 +211,7 @@ class SAC:
         """Networks and optimisers as flat dictionaries of tensors."""
         networks = state_of(**self._modules)
         networks["log_alpha"] = self.log_alpha.detach()
-        moments = moments_of("adam", self.optimizer)
+        moments = moments_of(self.optimizer)
         moments["generator"] = self._generator.get_state()
         return networks, moments
 
@@ -223,6 +224,6 @@ class SAC:
         self.load_weights(networks)
         with torch.no_grad():
             self.log_alpha.copy_(networks["log_alpha"])
-        load_moments("adam", self.optimizer, moments)
+        load_moments(self.optimizer, moments)
         self._generator.set_state(moments["generator"])
         self.updates = updates

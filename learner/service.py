@@ -22,7 +22,7 @@ from torch.utils.tensorboard import SummaryWriter
 from common.bus import BUSY, Keys, QueryServer, announce, publish, serve
 from common.contract import check_digest, contract_encoder, make_contract
 from common.delivery import unpack_header
-from common.errors import RunError
+from common.errors import RunError, UsageError
 from common.files import write_atomically
 from common.messages import (
     ENDINGS,
@@ -39,7 +39,7 @@ from common.messages import (
 from common.networks import state_of
 from common.observation import ObservationLayout
 from common.resources import check_memory, learner_threads
-from common.telemetry import Rate, Reporter
+from common.telemetry import Rate, Reporter, stop_on_signals
 from common.weights import pack
 from common.world_config import StartRanges
 from learner.checkpoint import RunDirectory
@@ -49,6 +49,8 @@ from learner.replay.buffer import Replay
 from learner.sac import Losses
 
 log = logging.getLogger(__name__)
+RETRY_SECONDS = 5.0
+"""Until a snapshot that could not be written is tried again."""
 BEST_OF = 100
 """Tasks whose success decides which policy is the best so far; at least half of them must be there."""
 
@@ -136,8 +138,7 @@ class LearnerService:
         self._blobs: dict[str, bytes] = {}
         self._blobs_lock = threading.Lock()
         self._publish()
-        every = config.learner.snapshot_steps
-        self._snapshot_due = (self._log.env_steps // every + 1) * every
+        self._snapshot_due = self._next_snapshot()
         self._servers = [
             QueryServer(session, self.keys.trajectory, self._take, commit=self._log.commit),
             serve(session, self.keys.contract, Nothing, self._answer_contract),
@@ -155,13 +156,14 @@ class LearnerService:
         return self.learner.sac.updates
 
     def run(self) -> None:
-        """Learns until SystemExit, or until the minutes since the first episode are over.
+        """Learns until SIGTERM or SIGINT, or until the minutes since the first episode are over.
 
         Raises RunError when it cannot go on.
         """
+        stopping = stop_on_signals()  # not in the middle of an update, which the last checkpoint would keep
         rates = Rate(), Rate()
-        last_publish = last_checkpoint = last_board = time.monotonic()
-        while not self._over():
+        last_publish = last_checkpoint = last_board = snapshot_again = time.monotonic()
+        while not (self._over() or stopping.is_set()):
             self._ingest()
             now = time.monotonic()
             losses = self.learner.update(self._log.env_steps)
@@ -175,19 +177,21 @@ class LearnerService:
             if now - last_checkpoint >= self.config.learner.checkpoint_seconds:
                 last_checkpoint = now
                 self._try("a checkpoint", self._save)
-            if self._log.env_steps >= self._snapshot_due:
-                self._try("a snapshot", partial(self._snapshot, f"{self._log.env_steps:09d}"))
-                self._snapshot_due += self.config.learner.snapshot_steps
+            if self._log.env_steps >= self._snapshot_due and now >= snapshot_again:
+                if self._try("a snapshot", partial(self._snapshot, f"{self._log.env_steps:09d}")):
+                    self._snapshot_due = self._next_snapshot()
+                snapshot_again = now + RETRY_SECONDS
             if self._reporter.due:
                 self._report(rates[0].read(self._log.env_steps), rates[1].read(self.updates))
             if now - last_board >= 5.0:
                 last_board = now
                 speed = {"charts/SPS": rates[0].value, "charts/UPS": rates[1].value}
                 self._try("the curves", partial(self._draw, self.progress.figures() | speed))
-        log.info("the time is over after %d updates", self.updates)
+        why = "stopped" if stopping.is_set() else "the time is over"
+        log.info("%s after %d updates", why, self.updates)
 
     def close(self) -> None:
-        """Takes no more episodes, then writes checkpoint, final snapshot and summary.
+        """Takes no more episodes, then writes checkpoint, final snapshot and summary, and lets the folder go.
 
         Raises RunError when they cannot be written.
         """
@@ -208,6 +212,9 @@ class LearnerService:
                 f"cannot write the last checkpoint to {folder}: {error.strerror}; "
                 "the one before it and all episodes are whole, and the run resumes from them"
             ) from None
+        finally:
+            self.run_directory.release()
+            self._token.undeclare()  # type: ignore[no-untyped-call]
 
     def summary(self) -> dict[str, Any]:
         """The run in numbers."""
@@ -243,7 +250,12 @@ class LearnerService:
                 self.updates,
             )
         else:
-            self._try("a snapshot", partial(self._snapshot, "initial"))
+            try:
+                self._snapshot("initial")
+            except OSError as error:
+                raise UsageError(
+                    f"cannot write to the run directory {self.run_directory.folder}: {error.strerror}"
+                ) from None
 
     def _take(self, payload: bytes, attachment: bytes) -> bytes:
         """From the bus, in a thread of its own: an episode is acknowledged when it is in the log.
@@ -255,7 +267,8 @@ class LearnerService:
             return encode(Acknowledgement(duplicate=True))
         episode = decode(Episode, payload)
         check_digest(self.contract.digest, episode.digest)
-        episode.check_layout(self.learner.layout, self.config.world.max_episode_steps)
+        world = self.config.world
+        episode.check_layout(self.learner.layout, world.max_episode_steps, world.reward.largest)
         waiting = self._accepted - self.learner.limiter.inserted
         if not self.learner.limiter.may_insert(waiting + episode.length):
             raise MessageError(BUSY)
@@ -283,12 +296,14 @@ class LearnerService:
                 f"({self._log.broken.strerror}); what was not acknowledged is sent again after a restart"
             )
 
-    def _try(self, what: str, write: Callable[[], None]) -> None:
-        """Writes what can be written again later: a full disk must not end the training."""
+    def _try(self, what: str, write: Callable[[], None]) -> bool:
+        """Whether it could be written; if not, it is tried again: a full disk must not end the training."""
         try:
             write()
         except OSError as error:
             self._complain(what, error)
+            return False
+        return True
 
     def _complain(self, what: str, error: OSError) -> None:
         self._failed_writes += 1
@@ -340,6 +355,11 @@ class LearnerService:
         networks = self.learner.sac.policy_state() | self._frozen
         state = {"updates": self.updates, "env_steps": self._log.env_steps, **figures}
         self.run_directory.snapshot(name, networks, state)
+
+    def _next_snapshot(self) -> int:
+        """The number of environment steps at which the next snapshot is due."""
+        every = self.config.learner.snapshot_steps
+        return (self._log.env_steps // every + 1) * every
 
     def _over(self) -> bool:
         return self._began is not None and time.monotonic() - self._began >= 60 * self._minutes

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -37,10 +37,11 @@ class Processes:
         self.folder = folder
         self.running: dict[str, subprocess.Popen] = {}
 
-    def start(self, name: str, *arguments) -> subprocess.Popen:
+    def start(self, name: str, *arguments, inside: Iterable[str] = ()) -> subprocess.Popen:
+        """`inside` is what to put before the command, to run it in another namespace."""
         with (self.folder / f"{name}.txt").open("ab") as output:
             self.running[name] = subprocess.Popen(
-                [sys.executable, "-m", "deploy.cli.main", *map(str, arguments)],
+                [*inside, sys.executable, "-m", "deploy.cli.main", *map(str, arguments)],
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
@@ -69,7 +70,7 @@ class Crew(Processes):
         self.run, self.spool, self.endpoint = run or folder / "run", folder / "spool", free_endpoint()
         self.settings: tuple[str, ...] = ()
         self.inside: list[str] = []
-        """What to put before the learner's command, to run it in another namespace."""
+        """Of the learner."""
         self.reports: dict[int, list[dict]] = defaultdict(list)
         """Figures of each life of the learner, by process id."""
         self.versions: list[Version] = []
@@ -78,15 +79,8 @@ class Crew(Processes):
 
     def start_learner(self) -> int:
         """Starts it, or starts it again with the same command; its process id."""
-        command = ["learner", "--run", str(self.run), "--listen", self.endpoint, *SETTINGS, *self.settings]
-        with (self.folder / "learner.txt").open("ab") as output:
-            self.running["learner"] = subprocess.Popen(
-                [*self.inside, sys.executable, "-m", "deploy.cli.main", *command],
-                stdout=output,
-                stderr=output,
-                start_new_session=True,
-            )
-        return self.running["learner"].pid
+        command = ("learner", "--run", self.run, "--listen", self.endpoint, *SETTINGS, *self.settings)
+        return self.start("learner", *command, inside=self.inside).pid
 
     def start_other(self, name: str) -> None:
         join = ("--connect", self.endpoint)

@@ -1,8 +1,6 @@
 import json
 import math
-import resource
 import shutil
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +22,7 @@ from learner import checkpoint
 from learner.checkpoint import RunDirectory
 from learner.learner import Learner
 from learner.sac import SAC
-from tests.helpers import small_config, tiny_episode
+from tests.helpers import largest_file, small_config, tiny_episode
 
 SETTINGS = ("learner.keep_checkpoints=2", "network.normalize=true")
 CONFIG = small_config(*SETTINGS)
@@ -107,19 +105,6 @@ def killed_at(monkeypatch: pytest.MonkeyPatch, place: Any, name: str, call: int 
         patch.setattr(place, name, die)
         with pytest.raises(KilledError):
             yield
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Lets no file of this process grow beyond `size`, as a full disk would."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def test_new_run_has_a_complete_configuration_and_an_identity(tmp_path):
@@ -209,9 +194,23 @@ def test_name_that_cannot_be_a_key_on_the_bus_is_refused(tmp_path, name):
 def test_epoch_counts_every_start_and_outlives_the_process(tmp_path):
     run = RunDirectory(tmp_path / "x", CONFIG)
     assert [run.next_epoch(), run.next_epoch()] == [1, 2]
-    assert RunDirectory(tmp_path / "x").next_epoch() == 3
-    assert RunDirectory(tmp_path / "x", CONFIG).next_epoch() == 4
-    assert names(run.folder) == ["config.toml", "encoder.safetensors", "run.json"]
+    run.release()
+    for epoch, config in ((3, None), (4, CONFIG)):
+        again = RunDirectory(tmp_path / "x", config)
+        assert again.next_epoch() == epoch
+        again.release()
+    assert names(run.folder) == ["config.toml", "encoder.safetensors", "lock", "run.json"]
+
+
+def test_folder_belongs_to_one_learner_at_a_time(tmp_path):
+    run = RunDirectory(tmp_path / "x", CONFIG)
+    assert run.next_epoch() == 1
+    other = RunDirectory(tmp_path / "x")
+    with pytest.raises(UsageError, match=r"another learner trains in .*x; stop it first, or choose another"):
+        other.next_epoch()
+    assert json.loads((run.folder / "run.json").read_text())["epoch"] == 1
+    run.release()
+    assert other.next_epoch() == 2
 
 
 def test_folder_that_cannot_be_written_is_a_usage_error(tmp_path):

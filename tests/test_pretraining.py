@@ -558,7 +558,7 @@ def stepped(
     for step in range(steps):
         if step == 2 and start is not None:
             optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
-            load_moments("adam", optimizer, {k: v for k, v in start.items() if not skip or skip not in k})
+            load_moments(optimizer, {k: v for k, v in start.items() if not skip or skip not in k})
         optimizer.zero_grad()
         ((step + 1) * module(torch.tensor([1.0, -2.0, 0.5])).square().sum()).backward()
         optimizer.step()
@@ -566,7 +566,7 @@ def stepped(
 
 
 def test_adam_goes_on_with_the_moments_that_were_kept():
-    moments = moments_of("adam", stepped(2)[1])
+    moments = moments_of(stepped(2)[1])
     assert sorted(moments) == sorted(
         f"adam.{index}.{key}" for index in (0, 1) for key in ("step", "exp_avg", "exp_avg_sq")
     )
@@ -578,12 +578,12 @@ def test_adam_goes_on_with_the_moments_that_were_kept():
 
 
 def test_parameters_without_moments_begin_anew():
-    moments = moments_of("adam", stepped(2)[1])
+    moments = moments_of(stepped(2)[1])
     expected, resumed, fresh = stepped(6)[0], stepped(6, moments, "adam.1.")[0], stepped(6, {})[0]
     assert not torch.equal(resumed.bias, expected.bias)
     assert not torch.equal(resumed.weight, fresh.weight)
-    assert moments_of("adam", stepped(3, moments, "adam.1.")[1])["adam.1.step"].item() == 1
-    assert moments_of("adam", stepped(3, moments, "adam.1.")[1])["adam.0.step"].item() == 3
+    assert moments_of(stepped(3, moments, "adam.1.")[1])["adam.1.step"].item() == 1
+    assert moments_of(stepped(3, moments, "adam.1.")[1])["adam.0.step"].item() == 3
 
 
 SHOWN = ("none", "left", "right")

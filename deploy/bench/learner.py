@@ -65,8 +65,8 @@ def soak_learner(config: Config, updates: int, progress: Callable[[int, str], No
     small = ("network.hidden=[32, 32]", "replay.capacity=20000", "replay.warmup_steps=1000")
     learner = Learner(override(config.model_dump(mode="json"), small))
     rng, steps, done, first = np.random.default_rng(config.seed), 25, 0, 0
-    before = 0.0
-    while done < updates + updates // 10:
+    before, warm = 0.0, max(1, updates // 10)
+    while done < updates + warm:
         learner.insert(synthetic_episode(config, steps, rng), first)
         first += steps
         while learner.update(first):
@@ -74,7 +74,7 @@ def soak_learner(config: Config, updates: int, progress: Callable[[int, str], No
             if done % 1000 == 0:
                 learner.save()
                 progress(min(done, updates), "")
-            if done == updates // 10:
+            if done == warm:
                 before = rss()
     return rss() - before
 
@@ -132,8 +132,9 @@ def _sb3(config: Config) -> Callable[[], None]:
 def _products(config: Config) -> Callable[[], None]:
     """The products that an update cannot do without, into memory that is there already.
 
-    Forward: policy on both observations, critics on three pairs. Backward: the weights of critics and policy,
-    and what lies between their layers; of the input only the actions' part, and that for the policy alone.
+    Forward: policy on both observations, critics on three pairs, of which two have one observation and so its
+    part of the first layer in common. Backward: the weights of critics and policy, and what lies between
+    their layers; of the input only the actions' part, and that for the policy alone.
     """
     batch, state = config.sac.batch_size, ObservationLayout.of(config).size
     hidden = config.network.hidden
@@ -149,7 +150,8 @@ def _products(config: Config) -> Callable[[], None]:
 
     critic, policy = (state + ACTION_SIZE, 1), (state, 2 * ACTION_SIZE)
     shapes = 2 * forward(*policy) + weights(*policy) + between(policy[1])
-    shapes += 2 * (3 * forward(*critic) + weights(*critic) + 2 * between(critic[1]))
+    shapes += 2 * (2 * forward(*critic) + weights(*critic) + 2 * between(critic[1]))
+    shapes += 2 * [(batch, ACTION_SIZE, hidden[0]), *forward(*critic)[1:]]
     shapes += 2 * [(batch, hidden[0], ACTION_SIZE)]
     work: list[tuple[Tensor, Tensor, Tensor]] = [
         (torch.randn(m, k), torch.randn(k, n), torch.empty(m, n)) for m, k, n in shapes

@@ -120,7 +120,7 @@ def _ours(learner: Learner) -> Cycle:
 
 
 def _chunks(learner: Learner) -> Iterator[dict[str, np.ndarray]]:
-    """All transitions of a learner's replay, flat, for a rival."""
+    """As many transitions as a learner's replay holds, drawn from it, flat, for a rival."""
     capacity = learner.config.replay.capacity
     for start, end in pairwise([*range(0, capacity, CHUNK), capacity]):
         batch = learner.replay.sample(end - start, learner.config.sac.n_step, learner.config.sac.gamma, 0.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import math
 import re
@@ -19,6 +18,7 @@ import typer
 
 from common.bus import check_endpoint, open_client, open_hub
 from common.errors import UsageError
+from common.files import lock
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
 
@@ -51,13 +51,8 @@ def learner(
     with open_hub(address) as session:
         service = LearnerService(session, directory, minutes if minutes is not None else math.inf)
         log.info("learner of run %r listens on %s", directory.name, address)
-        try:
-            service.run()
-        except SystemExit:
-            service.close()
-            raise
-        # after any other exception the state is not to be trusted: the last checkpoint stays the newest
-        service.close()
+        service.run()
+        service.close()  # not after an exception: the state is not to be trusted then
 
 
 def actor(
@@ -100,7 +95,7 @@ def actor(
             lock.close()
 
 
-def claim_name(spools: Path, wanted: str | None) -> tuple[str, IO[str]]:
+def claim_name(spools: Path, wanted: str | None) -> tuple[str, IO[bytes]]:
     """A name whose spool no other live actor of this host holds, with the lock on it.
 
     Without a wanted one, the first free of HOST-0, HOST-1, ...: a new actor so finds what its predecessor
@@ -109,13 +104,10 @@ def claim_name(spools: Path, wanted: str | None) -> tuple[str, IO[str]]:
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())[:48]
     for name in [wanted] if wanted else (f"{host}-{i}" for i in range(1000)):
         (spools / name).mkdir(parents=True, exist_ok=True)
-        lock = (spools / name / "lock").open("w")
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
+            return name, lock(spools / name / "lock")
+        except BlockingIOError:
             continue
-        return name, lock
     raise UsageError(f"an actor named {wanted!r} is already connected; choose another --name")
 
 

@@ -163,7 +163,7 @@ class Trainer:
     def save(self) -> None:
         """Writes the checkpoint, which is an encoder's folder with all that training needs to go on."""
         model = self.exported()
-        whole = state_of(model=self.model) | moments_of("adam", self._optimizer)
+        whole = state_of(model=self.model) | moments_of(self._optimizer)
         save_folder(
             self.folder / "checkpoint",
             {CONFIG: self.config.to_toml(), "state.json": json.dumps({"batches": self.done})},
@@ -183,7 +183,7 @@ class Trainer:
             self.done = int(json.loads((folder / "state.json").read_text("utf-8"))["batches"])
             tensors = load_tensors(folder / TRAINING)
             load_state(tensors, model=self.model)
-            load_moments("adam", self._optimizer, tensors)
+            load_moments(self._optimizer, tensors)
         except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise UsageError(f"checkpoint {folder} does not fit: {error}; remove it to begin anew") from None
 
