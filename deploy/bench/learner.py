@@ -63,6 +63,7 @@ def soak_learner(config: Config, updates: int, progress: Callable[[int, str], No
     The networks are small, the replay overwrites itself all the time, and checkpoints are taken.
     """
     small = ("network.hidden=[32, 32]", "replay.capacity=20000", "replay.warmup_steps=1000")
+    torch.set_num_threads(1)
     learner = Learner(override(config.model_dump(mode="json"), small))
     rng, steps, done, first = np.random.default_rng(config.seed), 25, 0, 0
     before, warm = 0.0, max(1, updates // 10)
