@@ -60,9 +60,14 @@ def bench_learner(config: Config, rounds: int, progress: Callable[[int, str], No
 def soak_learner(config: Config, updates: int, progress: Callable[[int, str], None]) -> float:
     """MB by which memory grows over so many updates, after a tenth as many to warm up.
 
-    The networks are small, the replay overwrites itself all the time, and checkpoints are taken.
+    Networks and batches are small, the replay overwrites itself all the time, and checkpoints are taken.
     """
-    small = ("network.hidden=[32, 32]", "replay.capacity=20000", "replay.warmup_steps=1000")
+    small = (
+        "network.hidden=[32, 32]",
+        "sac.batch_size=32",
+        "replay.capacity=20000",
+        "replay.warmup_steps=1000",
+    )
     torch.set_num_threads(1)
     learner = Learner(override(config.model_dump(mode="json"), small))
     rng, steps, done, first = np.random.default_rng(config.seed), 25, 0, 0
