@@ -356,7 +356,10 @@ class Subscription:
 
 
 def announce(session: zenoh.Session, keys: Keys, role: str, name: str) -> zenoh.LivelinessToken:
-    """Declares this process alive until the returned token is undeclared, or lost. Raises UsageError when the name is taken."""
+    """Declares this process alive until the returned token is undeclared, or lost.
+
+    Raises UsageError when the name is taken.
+    """
     key = keys.live(role, name)
     if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=2.0)):
         raise UsageError(f"a {role} named {name!r} is already connected; choose another --name")

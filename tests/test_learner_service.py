@@ -21,6 +21,8 @@ from tests.helpers import largest_file, small_config, tiny_episode, wait_until
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 Start = Callable[..., LearnerService]
+FIRST_EPISODE = 20 * 0.18
+"""Seconds that count as gone when the first episode arrives."""
 
 
 @pytest.fixture
@@ -114,7 +116,8 @@ def test_snapshots_come_every_so_many_steps_and_one_that_failed_comes_late(
     start, client, monkeypatch, caplog
 ):
     monkeypatch.setattr(module, "RETRY_SECONDS", 0.2)
-    service = start("learner.snapshot_steps=50", "learner.checkpoint_seconds=1000", seconds=7.0)  # 3.6 of them are the first episode
+    settings = ("learner.snapshot_steps=50", "learner.checkpoint_seconds=1000")
+    service = start(*settings, seconds=FIRST_EPISODE + 3.0)
     feeder = feeder_of(client, service)
     original, failures = service.run_directory.snapshot, []
 
@@ -186,7 +189,7 @@ def test_signal_ends_the_loop_between_two_rounds_and_all_is_saved(start, client,
 
 
 def test_restart_takes_up_where_the_last_checkpoint_and_the_log_were(start, client):
-    service = start(seconds=5.0)  # 3.6 of them are the first episode
+    service = start(seconds=FIRST_EPISODE + 1.5)
     feeder = feeder_of(client, service)
     for _ in range(6):
         feeder.deliver()
