@@ -16,8 +16,8 @@ from actor.inference import Eyes, PolicyActor
 from actor.rollout import Finished, Rollout
 from common.bus import Keys, announce, ask_later
 from common.config import Config
-from common.contract import contract_encoder
 from common.delivery import Sender, Spool, count_life
+from common.encoders import unpack_encoder
 from common.errors import UsageError
 from common.messages import (
     Candidate,
@@ -57,7 +57,7 @@ class ActorService:
         # each actor, and each of its lives, drives other episodes
         seeds = np.random.SeedSequence([config.seed, count_life(spool), *name.encode()]).spawn(2)
         self._rng = np.random.default_rng(seeds[0])
-        eyes = Eyes(config, contract_encoder(contract, config))
+        eyes = Eyes(config, unpack_encoder(contract.encoder, config))
         self._rollout = Rollout(config, eyes, config.actor.worlds, config.world.max_episode_steps)
         self._actor = PolicyActor(config, len(self._rollout), np.random.default_rng(seeds[1]))
         self._cells = [cells[i % len(cells)] for i in range(len(self._rollout))]

@@ -13,15 +13,13 @@ from operator import getitem
 from typing import Any
 
 import zenoh
-from safetensors.torch import load as load_tensors
 
 from common.bus import Keys, ask
 from common.cells import CELLS
 from common.config import Config, differing_keys, override, parse
-from common.encoders import content_hash
 from common.errors import UsageError
+from common.files import content_hash
 from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
-from common.networks import Encoder, load_state, make_encoder
 from common.observation import HISTORY
 
 AGREED = {
@@ -71,16 +69,6 @@ def check_digest(ours: dict[str, str], theirs: dict[str, str]) -> None:
 def make_contract(run: str, config: Config, encoder: bytes) -> ContractReply:
     """The contract of a run with these weights of its frozen encoder."""
     return ContractReply(run=run, config=config.to_toml(), encoder=encoder, digest=digest(config, encoder))
-
-
-def contract_encoder(contract: ContractReply, config: Config) -> Encoder:
-    """The encoder with the contract's weights; raises UsageError when they do not fit `config`."""
-    encoder = make_encoder(config)
-    try:
-        load_state(load_tensors(contract.encoder), encoder=encoder)
-    except Exception as error:  # safetensors raises its own class without exporting a common base
-        raise UsageError(f"the run's encoder does not fit: {error}") from None
-    return encoder
 
 
 def accept_contract(contract: ContractReply, overrides: tuple[str, ...] = ()) -> Config:

@@ -6,9 +6,9 @@ only its figures need).
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
+from safetensors.torch import load as parse_tensors
 from safetensors.torch import save as save_tensors
 
 from common.config import Config, differing_keys
@@ -69,6 +69,11 @@ def pack_encoder(encoder: Encoder) -> bytes:
     return save_tensors(state_of(encoder=encoder))
 
 
-def content_hash(weights: bytes) -> str:
-    """What identifies an encoder: the beginning of its weights' SHA-256."""
-    return hashlib.sha256(weights).hexdigest()[:16]
+def unpack_encoder(weights: bytes, config: Config) -> Encoder:
+    """The encoder of packed weights; raises UsageError when they do not fit `config`."""
+    encoder = make_encoder(config)
+    try:
+        load_state(parse_tensors(weights), encoder=encoder)
+    except Exception as error:  # safetensors raises its own class without exporting a common base
+        raise UsageError(f"the run's encoder does not fit: {error}") from None
+    return encoder

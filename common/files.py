@@ -1,8 +1,9 @@
-"""Files that are written whole or not at all, and folders that belong to one process."""
+"""Files that are written whole or not at all, that belong to one process, and what identifies them."""
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 from pathlib import Path
 from typing import IO
@@ -26,6 +27,11 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def content_hash(content: bytes) -> str:
+    """What identifies a content: the beginning of its SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def lock(path: Path) -> IO[bytes]:

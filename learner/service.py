@@ -20,8 +20,9 @@ import zenoh
 from torch.utils.tensorboard import SummaryWriter
 
 from common.bus import BUSY, Keys, QueryServer, announce, publish, serve
-from common.contract import check_digest, contract_encoder, make_contract
+from common.contract import check_digest, make_contract
 from common.delivery import unpack_header
+from common.encoders import unpack_encoder
 from common.errors import RunError, UsageError
 from common.files import write_atomically
 from common.messages import (
@@ -124,7 +125,7 @@ class LearnerService:
         log.info("SAC on %s, %d thread(s) of torch", self.learner.sac.device, torch.get_num_threads())
         self.contract = make_contract(run.name, config, run.encoder)
         frozen = not config.encoder.end_to_end
-        self._frozen = state_of(encoder=contract_encoder(self.contract, config)) if frozen else {}
+        self._frozen = state_of(encoder=unpack_encoder(run.encoder, config)) if frozen else {}
         self._epoch = run.next_epoch()
         sync = config.learner.durability == "host"
         self._log = EpisodeLog(run.folder / "log", config.replay.capacity, sync=sync)

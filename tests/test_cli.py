@@ -173,3 +173,11 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys)
     with options.progress("drives", 40) as report:
         report(10)
     assert capsys.readouterr().err == ""
+
+
+def test_commands_that_compute_nothing_do_not_wait_for_torch():
+    code = (
+        "import sys, deploy.cli.main; "
+        "assert not {'torch', 'pybullet', 'onnxruntime'} & set(sys.modules), 'slow to import'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -6,11 +6,10 @@ from common.config import override, parse, resolve
 from common.contract import (
     accept_contract,
     check_digest,
-    contract_encoder,
     digest,
     make_contract,
 )
-from common.encoders import pack_encoder
+from common.encoders import pack_encoder, unpack_encoder
 from common.errors import UsageError
 from common.messages import ContractReply, MessageError, decode, encode
 from common.networks import make_encoder
@@ -128,7 +127,7 @@ def test_encoder_arrives_to_the_bit_through_the_contract():
     assert contract.run == "run-1"
     config = accept_contract(contract)
     assert config == CONFIG
-    expected, found = make_encoder(CONFIG).state_dict(), contract_encoder(contract, config).state_dict()
+    expected, found = make_encoder(CONFIG).state_dict(), unpack_encoder(contract.encoder, config).state_dict()
     assert set(found) == set(expected)
     assert all(torch.equal(found[key], expected[key]) for key in expected)
 
@@ -137,7 +136,7 @@ def test_encoder_comes_from_the_contract_and_not_from_the_seed():
     contract = make_contract("r", CONFIG, ENCODER)
     other = resolve("smoke", seed=CONFIG.seed + 1)
     expected = make_encoder(CONFIG).state_dict()
-    found = contract_encoder(contract, other).state_dict()
+    found = unpack_encoder(contract.encoder, other).state_dict()
     assert all(torch.equal(found[key], expected[key]) for key in expected)
 
 
@@ -213,10 +212,10 @@ def test_tampered_encoder_weights_are_refused():
 @pytest.mark.parametrize("preset", ["paper", "fast"])
 def test_encoder_of_another_shape_is_a_usage_error(preset):
     with pytest.raises(UsageError, match=r"the run's encoder does not fit: tensor encoder\.blocks"):
-        contract_encoder(make_contract("r", CONFIG, ENCODER), resolve(preset))
+        unpack_encoder(ENCODER, resolve(preset))
 
 
 def test_encoder_that_is_no_safetensors_is_a_usage_error():
     contract = make_contract("r", CONFIG, ENCODER).model_copy(update={"encoder": b"junk"})
     with pytest.raises(UsageError, match="the run's encoder does not fit"):
-        contract_encoder(contract, CONFIG)
+        unpack_encoder(contract.encoder, CONFIG)

@@ -21,13 +21,13 @@ from common.encoders import (
     RANDOM,
     SHIPPED,
     SHIPPED_FOLDER,
-    content_hash,
     encoder_folder,
     frozen_encoder,
     pack_encoder,
     read_encoder,
 )
 from common.errors import UsageError
+from common.files import content_hash
 from common.networks import Encoder, compile_encoder, export_onnx, make_encoder, state_of
 from common.policy_files import CONFIG, save_folder
 from common.resources import check_disk, check_memory

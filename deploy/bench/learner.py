@@ -65,7 +65,7 @@ def soak_learner(config: Config, updates: int, progress: Callable[[int, str], No
     small = (
         "network.hidden=[32, 32]",
         "sac.batch_size=32",
-        "replay.capacity=20000",
+        "replay.capacity=4000",
         "replay.warmup_steps=1000",
     )
     torch.set_num_threads(1)

@@ -13,7 +13,6 @@ from rich.table import Table
 
 from common.bus import check_endpoint
 from common.config import Config, Objective
-from common.encoders import RANDOM, encoder_folder
 from common.telemetry import exit_on_signals
 from deploy.cli import options
 from deploy.launcher import free_port
@@ -72,6 +71,8 @@ def pretrain(
 ) -> None:
     """Pre-train the image encoder: actors gather frames, then it learns; repeat the command to resume."""
     if examined is not None:
+        from common.encoders import encoder_folder
+
         result = _examine(encoder_folder(examined))
         result = {"encoder": examined, **result}
     else:
@@ -90,6 +91,7 @@ def _open(
     run: Path, preset: str | None, file: Path | None, settings: list[str], seed: int | None
 ) -> tuple[Path, str, Config]:
     """Folder, name and configuration of a run, a new one or one to resume."""
+    from common.encoders import RANDOM
     from learner.checkpoint import RunDirectory
 
     wanted = None
