@@ -162,6 +162,7 @@ class Sender:
             path, key, header, payload = head
             try:
                 ask_bytes(self._session, key, payload, header, self._timeout)
+                self.spool.remove(path)
                 self.sent += 1
             except (NoAnswerError, RefusedError, zenoh.ZError) as error:
                 self.held_back = str(error) == BUSY
@@ -170,10 +171,10 @@ class Sender:
                     self._stop.wait(pause * jitter.uniform(0.5, 1.5))
                     pause = min(2 * pause, 2.0)
                     continue
+                self.spool.remove(path)
                 self.last_refusal = str(error)
                 self.refused[str(error).split(":")[0][:60]] += 1
                 log.warning("refused for good on %s: %s", key, error)
-            self.spool.remove(path)
             self.waiting_since, self.held_back, pause = None, False, 0.1
 
     def close(self, patience: float) -> int:
