@@ -7,7 +7,6 @@ import math
 import multiprocessing
 import os
 import signal
-import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import zenoh
 
 from actor.world.world import DockingWorld
-from common.bus import Keys, announce
+from common.bus import Keys, Member, announce
 from common.cells import CELLS, arena_index
 from common.config import Config
 from common.delivery import Sender, Spool, count_life
@@ -24,7 +23,7 @@ from common.frames import Film
 from common.geometry import bearing, wrap
 from common.messages import ContractReply, Frames
 from common.tasks import FIRST_SUITE_SEED, Task, narrowed_task
-from common.telemetry import Rate, Reporter
+from common.telemetry import Rate, Reporter, stop_on_signals
 
 log = logging.getLogger(__name__)
 SPREAD = 0.6
@@ -122,22 +121,22 @@ class FrameService:
         session: zenoh.Session,
         contract: ContractReply,
         config: Config,
-        name: str,
+        member: Member,
         spool: Path,
         cells: list[int],
     ) -> None:
         self.config, self.contract = config, contract
         self.keys = Keys(contract.run)
-        self._token = announce(session, self.keys, "actor", name)
-        self._rng = np.random.default_rng([config.seed, 5, count_life(spool), *name.encode()])
+        self._token = announce(session, self.keys, member)
+        self._rng = np.random.default_rng([config.seed, 5, count_life(spool), *member.name.encode()])
         self._worlds = {cell: DockingWorld(config.world, config.world.max_episode_steps) for cell in cells}
         self._sender = Sender(
             session,
             Spool(spool / "learner", config.actor.spool_megabytes * 2**20),
-            name,
+            member,
             uuid.uuid4().hex[:12],
         )
-        self._reporter = Reporter(session, self.keys, "actor", name)
+        self._reporter = Reporter(session, self.keys, member)
         self._frames, self._rate = 0, Rate()
 
     @property
@@ -146,11 +145,14 @@ class FrameService:
         return len(self._worlds)
 
     def run(self) -> None:
-        """Films until SystemExit."""
-        while True:
+        """Films until SIGTERM or SIGINT."""
+        stopping = stop_on_signals()
+        while not stopping.is_set():
             for cell, world in self._worlds.items():
-                while self._sender.spool.full:
-                    time.sleep(0.1)  # back-pressure: the receiver is behind or away
+                while self._sender.spool.full and not stopping.is_set():
+                    stopping.wait(0.1)  # back-pressure: the receiver is behind or away
+                if stopping.is_set():
+                    break
                 task = narrowed_task(cell, self.config, self._rng, self.config.pretraining.near_share)
                 found = film(world, task, self._rng, self.config.pretraining.drive_steps)
                 message = Frames(digest=self.contract.digest, task=task, **found._asdict())

@@ -7,6 +7,7 @@ import queue
 import time
 import uuid
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +15,27 @@ import zenoh
 
 from actor.inference import Eyes, PolicyActor
 from actor.rollout import Finished, Rollout
-from common.bus import Keys, announce, ask_later
+from common.bus import Keys, Member, NoAnswerError, RefusedError, announce, ask_later
 from common.config import Config
+from common.contract import CONTRACT_DIFFERS
 from common.delivery import Sender, Spool, count_life
 from common.encoders import unpack_encoder
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.messages import (
     Candidate,
     Candidates,
     ContractReply,
+    MessageError,
     Outcome,
     Proposal,
     Proposals,
     TaskQuery,
     Version,
+    decode,
+    encode,
 )
 from common.tasks import Task, candidate_task, random_task
-from common.telemetry import Rate, Reporter
+from common.telemetry import Quantiles, Rate, Reporter, stop_on_signals
 from common.weights import WeightsPuller
 
 log = logging.getLogger(__name__)
@@ -45,17 +50,17 @@ class ActorService:
         session: zenoh.Session,
         contract: ContractReply,
         config: Config,
-        name: str,
+        member: Member,
         spool: Path,
         cells: list[int],
     ) -> None:
-        self.config, self.contract, self.name = config, contract, name
+        self.config, self.contract = config, contract
         self.keys = Keys(contract.run)
         self._session = session
-        self._token = announce(session, self.keys, "actor", name)
+        self._token = announce(session, self.keys, member)
         boot = uuid.uuid4().hex[:12]
         # each actor, and each of its lives, drives other episodes
-        seeds = np.random.SeedSequence([config.seed, count_life(spool), *name.encode()]).spawn(2)
+        seeds = np.random.SeedSequence([config.seed, count_life(spool), *member.name.encode()]).spawn(2)
         self._rng = np.random.default_rng(seeds[0])
         eyes = Eyes(config, unpack_encoder(contract.encoder, config))
         self._rollout = Rollout(config, eyes, config.actor.worlds, config.world.max_episode_steps)
@@ -63,16 +68,17 @@ class ActorService:
         self._cells = [cells[i % len(cells)] for i in range(len(self._rollout))]
         self._weights = WeightsPuller(session, self.keys, "policy")
         limit = config.actor.spool_megabytes * 2**20
-        self._episodes = Sender(session, Spool(spool / "learner", limit), name, boot)
-        self._reports = Sender(session, Spool(spool / "curriculum", limit / 8), name, boot, timeout=5.0)
+        self._episodes = Sender(session, Spool(spool / "learner", limit), member, boot)
+        self._reports = Sender(session, Spool(spool / "curriculum", limit / 8), member, boot, timeout=5.0)
         self._proposals: list[Proposal | None] = [None] * len(self._rollout)
         self._first_version = [Version()] * len(self._rollout)
         self._agent_steps = [0] * len(self._rollout)
-        self._answers: queue.SimpleQueue[tuple[int, Proposals | None]] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[tuple[int, float, bytes | Exception]] = queue.SimpleQueue()
+        self._task_latency = Quantiles()
         self._candidates: list[Candidate] = []
         self._categories: Counter[str] = Counter()
         self._endings: Counter[str] = Counter()
-        self._reporter = Reporter(session, self.keys, "actor", name)
+        self._reporter = Reporter(session, self.keys, member)
         self._rate = Rate()
 
     @property
@@ -81,15 +87,20 @@ class ActorService:
         return len(self._rollout)
 
     def run(self) -> None:
-        """Drives until SystemExit."""
+        """Drives until SIGTERM or SIGINT; raises RunError when the learner has another contract by now."""
+        stopping = stop_on_signals()  # not in the middle of anything
         for slot in range(len(self._rollout)):
             for _ in range(self.config.actor.candidates_at_start):
+                if stopping.is_set():
+                    return
                 self._look(slot)
             self._send_candidates()
             self._ask(slot)
-        while True:
+        while not stopping.is_set():
             self._start_answered()
             self._refresh_weights()
+            if self._episodes.last_refusal.startswith(CONTRACT_DIFFERS):
+                raise RunError(f"the run is not the one it was: {self._episodes.last_refusal}; start again")
             if self._episodes.spool.full or self._episodes.held_back:
                 time.sleep(0.05)  # back-pressure: the learner is behind or away
             else:
@@ -111,21 +122,19 @@ class ActorService:
     def _ask(self, slot: int) -> None:
         """Asks for the slot's next task; the other worlds go on meanwhile."""
         query = TaskQuery(cell=self._cells[slot], t=self._agent_steps[slot])
-        ask_later(
-            self._session,
-            self.keys.task,
-            query,
-            Proposals,
-            lambda answer, slot=slot: self._answers.put((slot, answer)),  # type: ignore[misc]
-            self.config.actor.task_timeout,
-        )
+        timeout, asked = self.config.actor.task_timeout, time.monotonic()
+        answer = partial(self._hear, slot, asked)
+        ask_later(self._session, self.keys.task, encode(query), answer, timeout, urgent=True)
+
+    def _hear(self, slot: int, asked: float, answer: bytes | Exception) -> None:
+        self._answers.put((slot, 1000 * (time.monotonic() - asked), answer))
 
     def _start_answered(self) -> None:
         while not self._answers.empty():
-            slot, answer = self._answers.get()
-            proposal = answer.tasks[0] if answer and answer.tasks else None
-            if proposal is not None and proposal.task.cell != self._cells[slot]:
-                proposal = None
+            slot, waited_ms, answer = self._answers.get()
+            proposal = _proposal(answer, self._cells[slot])
+            if proposal is not None:
+                self._task_latency.add(waited_ms)
             task = proposal.task if proposal else random_task(self._cells[slot], self.config, self._rng)
             self._proposals[slot] = proposal
             self._categories[proposal.category if proposal else "unserved"] += 1
@@ -188,7 +197,7 @@ class ActorService:
         self._candidates = []
 
     def _report(self) -> None:
-        waiting = self._episodes.waiting_since
+        version = self._actor.newest.version
         self._reporter.report(
             {
                 "env_steps": self._rollout.steps,
@@ -197,10 +206,34 @@ class ActorService:
                 "spool_full": int(self._episodes.spool.full),
                 "acknowledged": self._episodes.sent,
                 "refused": sum(self._episodes.refused.values()),
-                "refusal": self._episodes.last_refusal[:120],
-                "weights": self._actor.newest.version.counter,
-                "waiting_s": round(time.monotonic() - waiting, 1) if waiting else 0.0,
+                "refusal": (self._episodes.last_refusal or self._reports.last_refusal)[:120],
+                "weights": f"{version.epoch}.{version.counter}",
+                "waiting_s": _seconds_since(self._episodes.waiting_since),
+                "trouble": self._episodes.trouble[:120],
+                "reports": len(self._reports.spool),
+                "reports_refused": sum(self._reports.refused.values()),
+                "reports_waiting_s": _seconds_since(self._reports.waiting_since),
+                **self._episodes.latency.figures("episode", "ms"),
+                **self._reports.latency.figures("report", "ms"),
+                **self._task_latency.figures("task", "ms"),
+                **self._weights.latency.figures("weights", "ms"),
                 **{f"ending_{key}": value for key, value in self._endings.items()},
                 **{f"task_{key}": value for key, value in self._categories.items()},
             }
         )
+
+
+def _seconds_since(moment: float | None) -> float:
+    return round(time.monotonic() - moment, 1) if moment else 0.0
+
+
+def _proposal(answer: bytes | Exception, cell: int) -> Proposal | None:
+    """The proposal for a cell in what the curriculum answered, if there is one."""
+    try:
+        if isinstance(answer, Exception):
+            raise answer
+        tasks = decode(Proposals, answer).tasks
+    except (NoAnswerError, RefusedError, MessageError) as error:
+        log.info("no task: %s", error)
+        return None
+    return tasks[0] if tasks and tasks[0].task.cell == cell else None

@@ -11,19 +11,23 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
+import os
 import queue
 import re
+import sys
 import threading
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import TypeVar
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import zenoh
 
+from common.access import LOCAL, Credentials, access_control, explain_refusal
 from common.errors import UsageError
-from common.messages import M, Message, MessageError, decode, encode
+from common.messages import MEGABYTE, M, Message, MessageError, decode, encode
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -32,13 +36,43 @@ BUSY = "BUSY"
 """The one refusal that means: again, later."""
 GROUP = 64
 """Queries that are answered together at most, where that spares work."""
+INBOX_BYTES = 256 * MEGABYTE
+"""Queries that wait for one server hold no more than this, besides the one that reaches it."""
+LOGGED = 1000
+"""Refusals that are logged, each once, before they are only counted."""
 INTERNAL_ERROR = "internal error"
+LARGEST_MESSAGE = 320 * MEGABYTE
+"""More than any message has; Zenoh drops what is larger before it is put together."""
+CLOSE_SECONDS = 1.5
+"""Until a session that cannot be closed is given up."""
 LEASE_MS = 3000
 """A frozen or unreachable peer is given up after this."""
 
 
+class Member(NamedTuple):
+    """A process of a run."""
+
+    role: str
+    group: str
+    """Common name of its certificate; `local` without one."""
+    name: str
+
+    @property
+    def address(self) -> str:
+        """Under which it delivers."""
+        return f"{self.group}/{self.name}"
+
+    @property
+    def label(self) -> str:
+        """What people call it."""
+        return self.name if self.group in (LOCAL, self.role) else self.address
+
+    def __str__(self) -> str:
+        return self.role if self.name == self.role else f"{self.role} {self.label}"
+
+
 class Keys:
-    """The key expressions of a run."""
+    """The key expressions of a run. Members deliver on `CHANNEL/GROUP/NAME`."""
 
     def __init__(self, run: str) -> None:
         self.root = f"navaclq/{run}"
@@ -54,13 +88,16 @@ class Keys:
         """Newest weights: `policy` for actors, `critic` (policy and critics) for the curriculum."""
         return f"{self.root}/weights/latest/{kind}"
 
-    def live(self, role: str, name: str) -> str:
-        """Liveliness token of a process."""
-        return f"{self.root}/live/{role}/{name}"
+    def live(self, member: Member, life: str) -> str:
+        """Liveliness token of a process, and of which of its lives."""
+        return f"{self.root}/live/{member.role}/{member.address}/{life}"
 
-    def stat(self, role: str, name: str) -> str:
+    def stat(self, member: Member) -> str:
         """Figures of a process."""
-        return f"{self.root}/stat/{role}/{name}"
+        return f"{self.root}/stat/{member.role}/{member.address}"
+
+
+EVERYBODY = Member("*", "*", "*")
 
 
 class NoAnswerError(Exception):
@@ -71,83 +108,156 @@ class RefusedError(Exception):
     """The receiver answered with an error; the text is its reason."""
 
 
-def check_endpoint(endpoint: str, insecure: bool = False) -> str:
-    """The endpoint itself; raises UsageError unless it is tcp/HOST:PORT, on loopback or `insecure`."""
-    match = re.fullmatch(r"tcp/(?:\[([0-9a-fA-F:]+)\]|([A-Za-z0-9_.-]+)):(\d{1,5})", endpoint)
-    if not match or not 0 < int(match[3]) < 65536:
-        raise UsageError(f"{endpoint!r} is no endpoint; write tcp/HOST:PORT, for example tcp/127.0.0.1:7447")
-    host = match[1] or match[2]
+class Link(NamedTuple):
+    """Where and how a process meets the others."""
+
+    endpoints: tuple[str, ...]
+    """Hubs in order of preference; for one that listens, its addresses."""
+    credentials: Credentials | None = None
+
+    @property
+    def group(self) -> str:
+        """That of the processes which use it."""
+        return self.credentials.name if self.credentials else LOCAL
+
+    def __str__(self) -> str:
+        return ", ".join(self.endpoints)
+
+
+def make_link(text: str, credentials: Credentials | None = None, insecure: bool = False) -> Link:
+    """The link to endpoints separated by commas, each tcp/HOST:PORT or tls/HOST:PORT.
+
+    Raises UsageError for anything else, for TLS without credentials, and for TCP beyond loopback unless
+    `insecure`.
+    """
+    endpoints = tuple(part.strip() for part in text.split(","))
+    for endpoint in endpoints:
+        match = re.fullmatch(r"(tcp|tls)/(?:\[([0-9a-fA-F:]+)\]|([A-Za-z0-9_.-]+)):(\d{1,5})", endpoint)
+        if not match or not 0 < int(match[4]) < 65536:
+            raise UsageError(
+                f"{endpoint!r} is no endpoint; write tcp/HOST:PORT or tls/HOST:PORT, "
+                "for example tcp/127.0.0.1:7447"
+            )
+        if match[1] == "tls":
+            if credentials is None:
+                raise UsageError(f"{endpoint} needs --certs, a folder that `navaclq certs` makes")
+        elif not (insecure or _is_loopback(match[2] or match[3])):
+            raise UsageError(
+                f"plain TCP to {match[2] or match[3]} is readable by anybody on the way; use a loopback "
+                "address, tls/HOST:PORT with --certs, or say --insecure on a network that you trust"
+            )
+    if credentials and any(endpoint.startswith("tcp/") for endpoint in endpoints):
+        raise UsageError(f"--certs is for tls/HOST:PORT; {text} has an endpoint without")
+    return Link(endpoints, credentials)
+
+
+def _is_loopback(host: str) -> bool:
     try:
-        loopback = ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        loopback = host == "localhost"
-    if not (loopback or insecure):
-        raise UsageError(
-            f"plain TCP to {host} is readable by anybody on the way; use a loopback address, "
-            "or say --insecure on a network that you trust"
-        )
-    return endpoint
+        return host == "localhost"
 
 
-def _session_config(mode: str, listen: str | None, connect: str | None) -> zenoh.Config:
+def _session_config(mode: str, listen: Link | None, connect: Link | None) -> zenoh.Config:
     config = zenoh.Config()
-    settings = {
+    settings: dict[str, Any] = {
         "mode": mode,
-        "listen/endpoints": [listen] if listen else [],
-        "connect/endpoints": [connect] if connect else [],
+        "listen/endpoints": listen.endpoints if listen else [],
+        "connect/endpoints": connect.endpoints if connect else [],
         "connect/timeout_ms": 1000,
         "connect/exit_on_failure": True,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
+        "transport/link/rx/max_message_size": LARGEST_MESSAGE,
     }
+    credentials = next((link.credentials for link in (listen, connect) if link and link.credentials), None)
+    if credentials:
+        settings["transport/link/tls"] = credentials.tls()
+        if listen:
+            settings["access_control"] = access_control(credentials.groups)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-@contextmanager
-def open_hub(endpoint: str) -> Iterator[zenoh.Session]:
-    """A session that listens on `endpoint`; raises UsageError when the address cannot be had."""
-    try:
-        session = zenoh.open(_session_config("peer", endpoint, None))
-    except zenoh.ZError as error:
-        raise UsageError(f"cannot listen on {endpoint}: is it in use? ({str(error)[:200]})") from None
-    with session:
-        yield session
+def open_hub(link: Link) -> AbstractContextManager[zenoh.Session]:
+    """A session that listens; raises UsageError when the address cannot be had."""
+    return _open("peer", link, None)
 
 
-@contextmanager
 def open_client(
-    endpoint: str, on_wait: Callable[[float], None] | None = None, patience: float = float("inf")
-) -> Iterator[zenoh.Session]:
-    """A session connected to a hub; waits for it up to `patience` s, telling `on_wait` the seconds so far.
+    link: Link, on_wait: Callable[[float], None] | None = None, patience: float = float("inf")
+) -> AbstractContextManager[zenoh.Session]:
+    """A session connected to the first hub that answers; waits up to `patience` s, telling `on_wait` the
+    seconds so far.
 
-    Raises NoAnswerError when patience ends first. A connection lost later is renewed by Zenoh itself.
+    Raises NoAnswerError when patience ends first, and UsageError when certificates are the reason. A
+    connection lost later is renewed by Zenoh itself.
     """
+    return _open("client", None, link, on_wait, patience)
+
+
+def open_router(
+    listen: Link, connect: Link | None, on_wait: Callable[[float], None] | None = None
+) -> AbstractContextManager[zenoh.Session]:
+    """A session that passes messages on between its clients and the hub that it is connected to, if any."""
+    return _open("router", listen, connect, on_wait)
+
+
+@contextmanager
+def _open(
+    mode: str,
+    listen: Link | None,
+    connect: Link | None,
+    on_wait: Callable[[float], None] | None = None,
+    patience: float = float("inf"),
+) -> Iterator[zenoh.Session]:
     began = time.monotonic()
     while True:
         try:
-            session = zenoh.open(_session_config("client", None, endpoint))
+            session = zenoh.open(_session_config(mode, listen, connect))
             break
-        except zenoh.ZError:
+        except zenoh.ZError as error:
+            if connect is None or "listener" in str(error):
+                raise UsageError(f"cannot listen on {listen}: is it in use? ({str(error)[:200]})") from None
+            if connect.credentials:
+                for endpoint in connect.endpoints:
+                    if refusal := explain_refusal(endpoint, connect.credentials):
+                        raise UsageError(refusal) from None  # waiting would not help
             waited = time.monotonic() - began
             if waited > patience:
-                raise NoAnswerError(f"no hub answers at {endpoint}") from None
+                raise NoAnswerError(f"no hub answers at {connect}") from None
             if on_wait:
                 on_wait(waited)
             time.sleep(0.2)
-    with session:
+    try:
         yield session
+    finally:
+        closing = threading.Thread(target=session.close, daemon=True)
+        closing.start()
+        closing.join(CLOSE_SECONDS)
+        if closing.is_alive():  # the other side is frozen or unreachable, with much on the way to it
+            log.warning("the connection is stuck, and given up")
+
+
+def end_process(code: int) -> NoReturn:
+    """Flushes and exits at once: threads of Zenoh that still run may hold up the interpreter's own end."""
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # closed by whoever read it
+            stream.flush()
+    os._exit(code)
 
 
 class QueryServer:
     """Answers the queries on one key expression from a thread of its own.
 
-    `handler` gets (payload, attachment) and returns the reply; a MessageError it raises is sent back as the
-    refusal. With `capacity` queries waiting the next one is told BUSY at once. Refusals but that one are
-    counted in `refused` by reason and logged at most once a second.
+    `handler` gets (payload, attachment, key) and returns the reply; a MessageError it raises is sent back as
+    the refusal, as one is for a payload larger than `max_bytes`. With `capacity` queries waiting, or as many
+    as fill INBOX_BYTES, the next one is told BUSY at once. Refusals but that one are counted in `refused` by
+    reason, and logged once for each sender and reason.
 
     With `commit`, queries that wait together are handled one after the other, then `commit` is called once,
     and only then are they answered: a disk that is slow to confirm confirms many at a time.
@@ -157,23 +267,45 @@ class QueryServer:
         self,
         session: zenoh.Session,
         key: str,
-        handler: Callable[[bytes, bytes], bytes],
+        handler: Callable[[bytes, bytes, str], bytes],
         capacity: int = 256,
         commit: Callable[[], None] | None = None,
+        max_bytes: int = MEGABYTE,
     ) -> None:
         self.refused: Counter[str] = Counter()
-        self._key, self._handler, self._commit = key, handler, commit
+        self._key, self._handler, self._commit, self._max_bytes = key, handler, commit, max_bytes
         self._inbox: queue.Queue[zenoh.Query | None] = queue.Queue(capacity)
-        self._logged, self._closed = 0.0, False
+        self._waiting_bytes, self._bytes_lock = 0, threading.Lock()
+        self._logged: set[tuple[str, str]] = set()
+        self._closed = False
         self._thread = threading.Thread(target=self._serve, name=f"serve {key}", daemon=True)
         self._thread.start()
         self._queryable = session.declare_queryable(key, self._receive)
 
+    def __len__(self) -> int:
+        """Queries that wait."""
+        return self._inbox.qsize()
+
     def _receive(self, query: zenoh.Query) -> None:
+        size = _size(query)
+        if size > self._max_bytes:
+            self._refuse(query, f"too large: {size} bytes; at most {self._max_bytes} are taken here")
+            return
+        with self._bytes_lock:
+            room = self._waiting_bytes < INBOX_BYTES
+            self._waiting_bytes += size if room else 0
         try:
+            if not room:
+                raise queue.Full
             self._inbox.put_nowait(query)
         except queue.Full:
+            if room:
+                self._release(size)
             self._refuse(query, BUSY)
+
+    def _release(self, size: int) -> None:
+        with self._bytes_lock:
+            self._waiting_bytes -= size
 
     def _serve(self) -> None:
         while (query := self._inbox.get()) is not None:
@@ -196,12 +328,15 @@ class QueryServer:
             log.exception("could not commit what came on %s", self._key)
             answers = [INTERNAL_ERROR] * len(queries)
         for query, answer in zip(queries, answers, strict=True):
+            self._release(_size(query))
             try:
                 if isinstance(answer, str):
                     self._refuse(query, answer)
                 else:
+                    # a query's own expression may hold wildcards, that of a server for many senders does
+                    key = self._key if "*" not in self._key else str(query.key_expr)
                     with query:
-                        query.reply(self._key, answer)  # the query's own expression may hold wildcards
+                        query.reply(key, answer)
             except Exception:  # this thread must outlive whatever one query brings, a lost session included
                 log.exception("could not answer %s", self._key)
 
@@ -210,7 +345,7 @@ class QueryServer:
         try:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             attachment = query.attachment.to_bytes() if query.attachment is not None else b""
-            return zenoh.ZBytes(self._handler(payload, attachment))
+            return zenoh.ZBytes(self._handler(payload, attachment, str(query.key_expr)))
         except MessageError as error:
             return str(error)
         except Exception:
@@ -219,13 +354,17 @@ class QueryServer:
 
     def _refuse(self, query: zenoh.Query, reason: str) -> None:
         if reason != BUSY:
-            self.refused[reason.split(":")[0][:40] if len(self.refused) < 100 else "other"] += 1
-            now = time.monotonic()
-            if now - self._logged >= 1.0:
-                self._logged = now
-                log.warning("refused a message on %s: %s", query.key_expr, reason)
+            self.note_refusal(str(query.key_expr), reason)
         with query:
             query.reply_err(reason.encode())
+
+    def note_refusal(self, key: str, reason: str) -> None:
+        """Counts a refusal, and logs it when it is the first of its kind."""
+        kind = reason.split(":")[0][:40] if len(self.refused) < 100 else "other"
+        self.refused[kind] += 1
+        if (key, kind) not in self._logged and len(self._logged) < LOGGED:
+            self._logged.add((key, kind))
+            log.warning("refused a message on %s: %s", key, reason)
 
     def close(self) -> None:
         """Stops taking queries and ends the thread after those already taken; once is enough."""
@@ -240,7 +379,14 @@ class QueryServer:
 
 def serve(session: zenoh.Session, key: str, kind: type[M], handler: Callable[[M], Message]) -> QueryServer:
     """A QueryServer for messages of one type."""
-    return QueryServer(session, key, lambda payload, _: encode(handler(decode(kind, payload))))
+    return QueryServer(
+        session, key, lambda payload, *_: encode(handler(decode(kind, payload))), max_bytes=kind.max_bytes
+    )
+
+
+def _size(query: zenoh.Query) -> int:
+    """Bytes that a query carries, which are not copied to count them."""
+    return sum(len(part) for part in (query.payload, query.attachment) if part is not None)
 
 
 def _read(reply: zenoh.Reply) -> bytes:
@@ -298,28 +444,36 @@ def ask(
 def ask_later(
     session: zenoh.Session,
     key: str,
-    question: Message,
-    kind: type[M],
-    answer: Callable[[M | None], None],
+    payload: bytes,
+    answer: Callable[[bytes | Exception], None],
     timeout: float,
+    attachment: bytes = b"",
+    urgent: bool = False,
 ) -> None:
-    """Asks without waiting; `answer` is called once from Zenoh's thread, with None if nothing usable came."""
-    found: list[M] = []
+    """Asks without waiting; `answer` is called once, from a thread of Zenoh that it must not block.
+
+    It gets the reply, or the NoAnswerError or RefusedError in its place.
+    """
+    found: list[bytes | Exception] = []
 
     def collect(reply: zenoh.Reply) -> None:
         try:
-            found.append(decode(kind, _read(reply)))
-        except (NoAnswerError, RefusedError, MessageError) as error:
-            log.info("no usable answer on %s: %s", key, error)
+            found.append(_read(reply))
+        except (NoAnswerError, RefusedError) as error:
+            found.append(error)
 
     session.get(
         key,
-        zenoh.handlers.Callback(collect, lambda: answer(found[0] if found else None)),
-        payload=encode(question),
+        zenoh.handlers.Callback(
+            collect, lambda: answer(found[0] if found else NoAnswerError(f"nobody serves {key}"))
+        ),
+        payload=payload,
+        attachment=attachment,
         timeout=timeout,
         consolidation=zenoh.ConsolidationMode.NONE,
-        priority=zenoh.Priority.INTERACTIVE_HIGH,
-        express=True,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
+        express=urgent,
     )
 
 
@@ -342,6 +496,8 @@ class Subscription:
 
         def receive(sample: zenoh.Sample) -> None:
             try:
+                if len(sample.payload) > kind.max_bytes:
+                    raise MessageError(f"too large: {len(sample.payload)} bytes")
                 handler(decode(kind, sample.payload.to_bytes()))
             except MessageError as error:
                 self._ignore(str(sample.key_expr), error)
@@ -355,22 +511,33 @@ class Subscription:
             log.warning("ignored a message on %s: %s", key, error)
 
 
-def announce(session: zenoh.Session, keys: Keys, role: str, name: str) -> zenoh.LivelinessToken:
+def announce(session: zenoh.Session, keys: Keys, member: Member) -> zenoh.LivelinessToken:
     """Declares this process alive until the returned token is undeclared, or lost.
 
-    Raises UsageError when the name is taken.
+    Raises UsageError when the name is taken: of two that come at once, at least the second.
     """
-    key = keys.live(role, name)
-    if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=2.0)):
-        raise UsageError(f"a {role} named {name!r} is already connected; choose another --name")
-    return session.liveliness().declare_token(key)
+    own = keys.live(member, uuid.uuid4().hex[:12])
+    token = session.liveliness().declare_token(own)
+    for reply in session.liveliness().get(keys.live(member, "*"), timeout=2.0):
+        if reply.ok is not None and str(reply.ok.key_expr) != own:
+            token.undeclare()  # type: ignore[no-untyped-call]
+            raise UsageError(
+                f"a {member.role} named {member.name!r} is already connected; choose another --name"
+            )
+    return token
 
 
-def watch_members(session: zenoh.Session, keys: Keys, handler: Callable[[str, str, bool], None]) -> object:
-    """Calls `handler(role, name, alive)` for every process present, joining or leaving; keep the result."""
+def watch_members(session: zenoh.Session, keys: Keys, handler: Callable[[Member, str, bool], None]) -> object:
+    """Calls `handler(member, life, alive)` for each process present, joining or leaving; keep the result."""
 
     def receive(sample: zenoh.Sample) -> None:
-        role, name = str(sample.key_expr).split("/")[-2:]
-        handler(role, name, sample.kind == zenoh.SampleKind.PUT)
+        *_, role, group, name, life = str(sample.key_expr).split("/")
+        handler(Member(role, group, name), life, sample.kind == zenoh.SampleKind.PUT)
 
-    return session.liveliness().declare_subscriber(keys.live("*", "*"), receive, history=True)
+    return session.liveliness().declare_subscriber(keys.live(EVERYBODY, "*"), receive, history=True)
+
+
+def list_members(session: zenoh.Session, keys: Keys, who: Member = EVERYBODY) -> set[Member]:
+    """The processes that are alive at the hub now, of those that `who` covers."""
+    replies = session.liveliness().get(keys.live(who, "*"), timeout=2.0)
+    return {Member(*str(reply.ok.key_expr).split("/")[-4:-1]) for reply in replies if reply.ok is not None}

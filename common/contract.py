@@ -19,9 +19,11 @@ from common.cells import CELLS
 from common.config import Config, differing_keys, override, parse
 from common.errors import UsageError
 from common.files import content_hash
-from common.messages import SCHEMA_VERSION, ContractReply, MessageError, Nothing
+from common.messages import PROTOCOL, ContractReply, MessageError, Nothing
 from common.observation import HISTORY
 
+CONTRACT_DIFFERS = "contract differs"
+"""How a refusal for that begins."""
 AGREED = {
     "observation": ("world.camera", "world.lidar", "world.randomization", "encoder"),
     "dynamics": (
@@ -51,7 +53,7 @@ def digest(config: Config, encoder: bytes) -> dict[str, str]:
     settings["observation"].append(HISTORY)
     settings["dynamics"].append(repr(CELLS))
     return {
-        "protocol": str(SCHEMA_VERSION),
+        "protocol": str(PROTOCOL),
         "encoder": _short(values["encoder"]) if config.encoder.end_to_end else _short(encoder),
         **{field: _short(value) for field, value in settings.items()},
     }
@@ -62,7 +64,7 @@ def check_digest(ours: dict[str, str], theirs: dict[str, str]) -> None:
     for field, value in ours.items():
         if theirs.get(field) != value:
             raise MessageError(
-                f"contract differs in {field!r}: this run has {value}, got {theirs.get(field)}"
+                f"{CONTRACT_DIFFERS} in {field!r}: this run has {value}, got {theirs.get(field)}"
             )
 
 

@@ -1,45 +1,128 @@
 """Acknowledged delivery: a spool on the sender's disk, retries with one id, duplicates dropped on arrival.
 
-Used for everything that must arrive: episodes, outcomes, candidates. A message leaves the spool only when the
-receiver has acknowledged it, and keeps its id (`Origin`) through every retry, also by a later incarnation of
-the sender; so nothing is lost and nothing counts twice.
+Used for everything that must arrive: episodes, outcomes, candidates, frames. A message leaves the spool only
+when the receiver has acknowledged it, and keeps its id (`Origin`) through every retry, also by a later
+incarnation of the sender; so nothing is lost and nothing counts twice.
 """
 
 from __future__ import annotations
 
 import logging
+import queue
 import random
 import threading
 import time
 import zlib
 from collections import Counter, defaultdict
+from collections.abc import Callable
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import msgpack
 import zenoh
 
-from common.bus import BUSY, INTERNAL_ERROR, NoAnswerError, RefusedError, ask_bytes
-from common.messages import Message, MessageError, Origin, encode
+from common.bus import BUSY, INTERNAL_ERROR, Member, QueryServer, RefusedError, ask_later
+from common.messages import BUNDLE, Message, MessageError, Origin, Receipt, decode, encode
+from common.telemetry import Quantiles
 
 log = logging.getLogger(__name__)
 
+DAMAGED = "payload damaged: its checksum does not match"
+LATER = (BUSY, INTERNAL_ERROR, DAMAGED)
+"""Answers that mean: again, later. Any other refusal of a message is final."""
+BUNDLE_BYTES = 256 * 1024
+"""Small messages that wait go together until they are as large as this."""
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 2.0
+"""Seconds until a delivery that failed is tried again; doubled each time."""
 
-def pack_header(origin: Origin, payload: bytes) -> bytes:
-    """The attachment that identifies a message and guards its payload."""
-    data: bytes = msgpack.packb([origin.actor, origin.boot, origin.seq, zlib.crc32(payload)])
-    return data
+
+class Parcel(NamedTuple):
+    """A message on its way, with what identifies it and the checksum that guards it."""
+
+    origin: Origin
+    crc: int
+    payload: bytes
 
 
-def unpack_header(header: bytes, payload: bytes) -> Origin:
-    """The origin of a message; raises MessageError for a malformed header or a damaged payload."""
+Bundle = dict[Path, Parcel]
+"""What goes in one delivery, by its files in the spool."""
+
+
+def pack_bundle(parcels: list[Parcel]) -> tuple[bytes, bytes]:
+    """(payload, attachment) of a delivery: the messages in a row, and the header of each."""
+    headers = [[p.origin.actor, p.origin.boot, p.origin.seq, len(p.payload), p.crc] for p in parcels]
+    payload = parcels[0].payload if len(parcels) == 1 else b"".join(p.payload for p in parcels)
+    return payload, msgpack.packb(headers)
+
+
+def unpack_bundle(payload: bytes, attachment: bytes) -> list[Parcel]:
+    """The messages of a delivery, checksums not yet compared; MessageError if malformed."""
     try:
-        actor, boot, seq, crc = msgpack.unpackb(header)
-        origin = Origin(actor=actor, boot=boot, seq=seq)
+        headers = msgpack.unpackb(attachment)
+        parcels, start = [], 0
+        for actor, boot, seq, size, crc in headers:
+            if type(size) is not int or type(crc) is not int or size < 0:
+                raise TypeError
+            origin = Origin(actor=actor, boot=boot, seq=seq)
+            parcels.append(Parcel(origin, crc, payload[start : start + size]))
+            start += size
     except Exception:  # msgpack and pydantic each raise their own kinds; all mean the same here
-        raise MessageError("header: expected [actor, boot, seq, crc32]") from None
-    if crc != zlib.crc32(payload):
-        raise MessageError("payload damaged: its checksum does not match")
-    return origin
+        raise MessageError("header: expected [actor, boot, seq, size, crc32] of each message") from None
+    if not 1 <= len(parcels) <= BUNDLE or start != len(payload):
+        raise MessageError(f"header: {len(parcels)} messages of {start} bytes, got {len(payload)}")
+    return parcels
+
+
+class Receiver(QueryServer):
+    """Takes in what Senders deliver on `CHANNEL/GROUP/NAME`, each message once.
+
+    `take` gets (origin, payload), and the message is acknowledged after it and `commit` have returned. It may
+    raise MessageError, which refuses the message for good unless the reason is BUSY; any other error means:
+    later. A message that `seen` knows is acknowledged again. A sender may speak only for itself.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        channel: str,
+        take: Callable[[Origin, bytes], None],
+        seen: Callable[[Origin], bool],
+        max_bytes: int,
+        commit: Callable[[], None] | None = None,
+    ) -> None:
+        self.duplicates = 0
+        self._channel, self._take, self._seen = channel, take, seen
+        super().__init__(
+            session, f"{channel}/*/*", self._receive_bundle, commit=commit, max_bytes=max_bytes + BUNDLE_BYTES
+        )
+
+    def _receive_bundle(self, payload: bytes, attachment: bytes, key: str) -> bytes:
+        parcels = unpack_bundle(payload, attachment)
+        for parcel in parcels:
+            if key != f"{self._channel}/{parcel.origin.actor}":
+                raise MessageError(f"under another's name: {parcel.origin.actor}")
+        return encode(Receipt(answers=[self._receive_one(parcel, key) for parcel in parcels]))
+
+    def _receive_one(self, parcel: Parcel, key: str) -> str:
+        """Empty when it is here, else why not."""
+        try:
+            if parcel.crc != zlib.crc32(parcel.payload):
+                raise MessageError(DAMAGED)
+            if self._seen(parcel.origin):
+                self.duplicates += 1
+            else:
+                self._take(parcel.origin, parcel.payload)
+            return ""
+        except MessageError as error:
+            if str(error) != BUSY:
+                self.note_refusal(key, str(error))
+            return str(error)[:400]
+        except Exception:
+            log.exception("error while taking a message on %s", key)
+            self.note_refusal(key, INTERNAL_ERROR)
+            return INTERNAL_ERROR
 
 
 class Spool:
@@ -54,7 +137,6 @@ class Spool:
         self._waiting = {path: path.stat().st_size for path in found}
         self._bytes = sum(self._waiting.values())
         self._lock = threading.Lock()
-        self.changed = threading.Event()
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -64,35 +146,50 @@ class Spool:
         """Whether the waiting messages have reached the limit."""
         return self._bytes >= self.max_bytes
 
-    def put(self, origin: Origin, key: str, payload: bytes) -> None:
+    def put(self, origin: Origin, channel: str, payload: bytes) -> None:
         """Adds a message; the caller looks at `full` first."""
         path = self.folder / origin.boot / f"{origin.seq:012d}.msg"
         path.parent.mkdir(exist_ok=True)
-        record = msgpack.packb([key, pack_header(origin, payload), payload])
+        record = msgpack.packb([channel, origin.actor, origin.boot, origin.seq, zlib.crc32(payload), payload])
         part = path.with_suffix(".part")
         part.write_bytes(record)
         part.rename(path)
         with self._lock:
             self._waiting[path] = len(record)
             self._bytes += len(record)
-        self.changed.set()
 
-    def first(self) -> tuple[Path, str, bytes, bytes] | None:
-        """The oldest message: its file, key, header and payload; unreadable ones are set aside and logged."""
-        while True:
-            with self._lock:
-                path = next(iter(self._waiting), None)
-            if path is None:
-                return None
-            try:
-                key, header, payload = msgpack.unpackb(path.read_bytes())
-                unpack_header(header, payload)
-                return path, key, header, payload
-            except (OSError, ValueError, TypeError) as error:  # TypeError: msgpack of something else
-                log.warning("spool: %s is unreadable (%s); set aside", path, error)
-                self._forget(path)
-                if path.exists():
-                    path.rename(path.with_suffix(".bad"))
+    def bundle(self, without: set[Path]) -> tuple[str, Bundle]:
+        """The oldest messages that go together, in order: one channel, small ones only; maybe none.
+
+        Passes over `without`, those that are on their way. Unreadable ones are set aside and logged.
+        """
+        with self._lock:
+            waiting = list(islice((i for i in self._waiting.items() if i[0] not in without), BUNDLE))
+        channel, found, room = "", Bundle(), BUNDLE_BYTES
+        for path, size in waiting:
+            if found and size > room:
+                break
+            read = self._read(path)
+            if read is None:
+                continue
+            if found and read[0] != channel:
+                break
+            channel, found[path] = read
+            room -= size
+        return channel, found
+
+    def _read(self, path: Path) -> tuple[str, Parcel] | None:
+        try:
+            channel, actor, boot, seq, crc, payload = msgpack.unpackb(path.read_bytes())
+            if crc != zlib.crc32(payload):
+                raise ValueError("its checksum does not match")
+            return str(channel), Parcel(Origin(actor=actor, boot=boot, seq=seq), crc, payload)
+        except (OSError, ValueError, TypeError) as error:  # TypeError: msgpack of something else
+            log.warning("spool: %s is unreadable (%s); set aside", path, error)
+            self._forget(path)
+            if path.exists():
+                path.rename(path.with_suffix(".bad"))
+            return None
 
     def remove(self, path: Path) -> None:
         """Drops a message that was acknowledged or refused for good."""
@@ -114,68 +211,117 @@ def count_life(folder: Path) -> int:
 
 
 class Sender:
-    """Sends what is in a spool, in order, from a thread of its own, until acknowledged.
+    """Sends what is in a spool, oldest first, from a thread of its own, until acknowledged.
 
-    No reply, BUSY and an error within the receiver mean: again, later, with the same id. Any other refusal is
-    final: the message is dropped, counted in `refused` by reason and logged, and `last_refusal` holds the
-    reason. `held_back` while the receiver says BUSY: whoever produces messages had better pause.
+    At most `in_flight` deliveries are on their way at a time. No receipt, BUSY and an error within the
+    receiver mean: again, later, with the same id. Any other refusal of a message is final: it is dropped,
+    counted in `refused` by reason and logged, and `last_refusal` holds the reason. `held_back` while the
+    receiver says BUSY: whoever produces messages had better pause.
     """
 
     def __init__(
-        self, session: zenoh.Session, spool: Spool, actor: str, boot: str, timeout: float = 10.0
+        self,
+        session: zenoh.Session,
+        spool: Spool,
+        member: Member,
+        boot: str,
+        timeout: float = 10.0,
+        in_flight: int = 2,
     ) -> None:
         self.spool, self.sent = spool, 0
         self.refused: Counter[str] = Counter()
         self.last_refusal = ""
+        self.trouble = ""
+        """Why the last delivery did not succeed; empty after one that did."""
         self.waiting_since: float | None = None
         self.held_back = False
-        self._session, self._actor, self._boot, self._timeout = session, actor, boot, timeout
+        self.latency = Quantiles()
+        self._session, self._address, self._boot = session, member.address, boot
+        self._timeout, self._in_flight = timeout, in_flight
         self._seq, self._lock = 0, threading.Lock()
+        self._flying: set[Path] = set()
+        self._flights = 0
+        self._pause, self._resume, self._jitter = FIRST_PAUSE, 0.0, random.Random()
+        self._events: queue.SimpleQueue[tuple[Bundle, float, bytes | Exception] | None] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
-    def put(self, key: str, message: Message) -> None:
-        """Hands a message over for delivery on `key`."""
+    def put(self, channel: str, message: Message) -> None:
+        """Hands a message over for delivery on `channel`."""
         payload = encode(message)
         with self._lock:
-            origin = Origin(actor=self._actor, boot=self._boot, seq=self._seq)
-            self.spool.put(origin, key, payload)
+            self.spool.put(Origin(actor=self._address, boot=self._boot, seq=self._seq), channel, payload)
             self._seq += 1
+        self._events.put(None)
 
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                self._deliver()
+                self._send()
+                self._settle()
             except Exception:  # a full disk, say: the spool stays as it is, and is tried again
                 log.exception("delivery stopped; it goes on in a second")
                 self._stop.wait(1.0)
 
-    def _deliver(self) -> None:
-        pause, jitter = 0.1, random.Random()
-        while not self._stop.is_set():
-            self.spool.changed.clear()
-            head = self.spool.first()
-            if head is None:
-                self.spool.changed.wait(0.2)
-                continue
-            path, key, header, payload = head
+    def _send(self) -> None:
+        while self._flights < self._in_flight and time.monotonic() >= self._resume:
+            channel, bundle = self.spool.bundle(self._flying)
+            if not bundle:
+                return
+            payload, attachment = pack_bundle(list(bundle.values()))
+            began = time.monotonic()
+            answer = partial(self._hear, bundle, began)
+            self._flying |= bundle.keys()
+            self._flights += 1
             try:
-                ask_bytes(self._session, key, payload, header, self._timeout)
-                self.spool.remove(path)
+                ask_later(
+                    self._session, f"{channel}/{self._address}", payload, answer, self._timeout, attachment
+                )
+            except zenoh.ZError as error:
+                answer(error)
+
+    def _hear(self, bundle: Bundle, began: float, answer: bytes | Exception) -> None:
+        self._events.put((bundle, began, answer))
+
+    def _settle(self) -> None:
+        """Waits for something to happen, and deals with it."""
+        left = self._resume - time.monotonic()
+        try:
+            event = self._events.get(timeout=min(left, 0.2) if left > 0 else 0.2)
+        except queue.Empty:
+            return
+        if event is None:
+            return
+        bundle, began, answer = event
+        self._flying -= bundle.keys()
+        self._flights -= 1
+        answers = _answers(answer, len(bundle))
+        later = ""
+        for (path, parcel), reason in zip(bundle.items(), answers, strict=True):
+            if reason is None or reason in LATER:
+                later = reason or str(answer) or "no receipt"
+                continue
+            self.spool.remove(path)
+            if reason:
+                self.last_refusal = reason
+                self.refused[reason.split(":")[0][:60]] += 1
+                log.warning("refused for good, %s of %s: %s", parcel.origin.seq, parcel.origin.boot, reason)
+            else:
                 self.sent += 1
-            except (NoAnswerError, RefusedError, zenoh.ZError) as error:
-                self.held_back = str(error) == BUSY
-                if not isinstance(error, RefusedError) or str(error) in (BUSY, INTERNAL_ERROR):
-                    self.waiting_since = self.waiting_since or time.monotonic()
-                    self._stop.wait(pause * jitter.uniform(0.5, 1.5))
-                    pause = min(2 * pause, 2.0)
-                    continue
-                self.spool.remove(path)
-                self.last_refusal = str(error)
-                self.refused[str(error).split(":")[0][:60]] += 1
-                log.warning("refused for good on %s: %s", key, error)
-            self.waiting_since, self.held_back, pause = None, False, 0.1
+        self.held_back, self.trouble = later == BUSY, later
+        if later:
+            self._back_off()
+        else:
+            self.latency.add(1000 * (time.monotonic() - began))
+            self.waiting_since, self._pause = None, FIRST_PAUSE
+
+    def _back_off(self) -> None:
+        now = time.monotonic()
+        self.waiting_since = self.waiting_since or now
+        if now >= self._resume:  # of several that were on their way together one counts
+            self._resume = now + self._pause * self._jitter.uniform(0.5, 1.5)
+            self._pause = min(2 * self._pause, LONGEST_PAUSE)
 
     def close(self, patience: float) -> int:
         """Tries for `patience` s to empty the spool, then stops; returns how many stay on disk."""
@@ -183,9 +329,24 @@ class Sender:
         while len(self.spool) and time.monotonic() < deadline:
             time.sleep(0.02)
         self._stop.set()
-        self.spool.changed.set()
+        self._events.put(None)
         self._thread.join(timeout=1.0)
         return len(self.spool)
+
+
+def _answers(answer: bytes | Exception, count: int) -> list[str | None]:
+    """What a receipt says of each message; None for all when there is no receipt that makes sense."""
+    if isinstance(answer, RefusedError) and str(answer) == BUSY:
+        return [BUSY] * count
+    if isinstance(answer, bytes):
+        try:
+            receipt = decode(Receipt, answer)
+        except MessageError as error:
+            log.warning("no receipt: %s", error)
+        else:
+            if len(receipt.answers) == count:
+                return [*receipt.answers]
+    return [None] * count
 
 
 MAX_GAP = 10_000

@@ -19,7 +19,12 @@ from common.observation import ACTION_SIZE, Columns, ObservationLayout
 from common.tasks import GeometricProperties, TrainingTask
 
 SCHEMA_VERSION = 1
+"""Of the encoded messages, those in logs too."""
+PROTOCOL = 2
+"""Of the bus: its keys, and how messages are delivered."""
 MEGABYTE = 2**20
+BUNDLE = 64
+"""Messages in one delivery at most."""
 
 Ending = Literal["success", "dolly_contact", "other_contact", "timeout"]
 ENDINGS: tuple[Ending, ...] = ("success", "dolly_contact", "other_contact", "timeout")
@@ -29,6 +34,8 @@ Category = Literal["easy", "frontier", "random", "gate", "rnd", "unserved"]
 is closed, `rnd` without curriculum; `unserved` when the curriculum did not answer."""
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
 CellIndex = Annotated[int, Field(ge=0, lt=len(CELLS))]
+Address = Annotated[str, Field(max_length=129, pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64})?$")]
+"""GROUP/NAME of a process; the group is the common name of its certificate, or `local`."""
 NonNegative = Annotated[int, Field(ge=0)]
 
 
@@ -83,7 +90,7 @@ def _check_array(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: 
 class Origin(Message):
     """Who made a message, once and for all: retries carry the same one, so that duplicates are recognised."""
 
-    actor: Name
+    actor: Address
     boot: Name
     """Fresh for every incarnation of the process."""
     seq: NonNegative
@@ -269,16 +276,22 @@ class Stat(Message):
     """A process's figures for the live screen, about once a second."""
 
     role: Name
-    id: Name
+    group: Name
+    name: Name
     host: Annotated[str, Field(max_length=128)]
     pid: NonNegative
-    values: Annotated[dict[str, float | int | str], Field(max_length=64)]
+    since: float
+    """Start of the process, seconds since 1970."""
+    code: Annotated[str, Field(max_length=64)]
+    """Version of the program; see common/version.py."""
+    protocol: NonNegative
+    values: Annotated[dict[str, float | int | str], Field(max_length=96)]
 
 
-class Acknowledgement(Message):
-    """The receiver has it for good."""
+class Receipt(Message):
+    """What became of each message of a delivery, in order: empty if the receiver has it, else why."""
 
-    duplicate: bool = False
+    answers: Annotated[list[Annotated[str, Field(max_length=400)]], Field(max_length=BUNDLE)]
 
 
 class Nothing(Message):
@@ -307,9 +320,9 @@ def decode(kind: type[M], data: bytes) -> M:
         raise MessageError("a message is [version, type, fields]")
     version, name, fields = outer
     if version != SCHEMA_VERSION:
-        raise MessageError(f"schema version {str(version)[:40]!r}, this side speaks {SCHEMA_VERSION}")
+        raise MessageError(f"schema version: {str(version)[:40]!r}, this side speaks {SCHEMA_VERSION}")
     if name != kind.__name__:
-        raise MessageError(f"message of type {str(name)[:40]!r} where {kind.__name__} is expected")
+        raise MessageError(f"message of another type: {str(name)[:40]!r} where {kind.__name__} is expected")
     try:
         return kind.model_validate(fields)
     except ValidationError as error:

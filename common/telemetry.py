@@ -9,20 +9,31 @@ import socket
 import sys
 import threading
 import time
+from collections import deque
 from types import FrameType
 
+import numpy as np
 import zenoh
 
-from common.bus import Keys, publish
-from common.messages import Stat
+from common.bus import Keys, Member, publish
+from common.messages import PROTOCOL, Stat
+from common.version import code_version
 
 
 class Reporter:
     """Publishes a process's figures at most once a second."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys, role: str, name: str) -> None:
-        self._session, self._key = session, keys.stat(role, name)
-        self._role, self._name = role, name
+    def __init__(self, session: zenoh.Session, keys: Keys, member: Member) -> None:
+        self._session, self._key = session, keys.stat(member)
+        self._told = Stat(
+            **member._asdict(),
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            since=time.time(),
+            code=code_version(),
+            protocol=PROTOCOL,
+            values={},
+        )
         self._last = 0.0
 
     @property
@@ -33,8 +44,7 @@ class Reporter:
     def report(self, values: dict[str, float | int | str]) -> None:
         """Publishes the figures."""
         self._last = time.monotonic()
-        stat = Stat(role=self._role, id=self._name, host=socket.gethostname(), pid=os.getpid(), values=values)
-        publish(self._session, self._key, stat)
+        publish(self._session, self._key, self._told.model_copy(update={"values": values}))
 
 
 class Rate:
@@ -50,6 +60,24 @@ class Rate:
             self.value = (count - self._count) / (now - self._time)
             self._count, self._time = count, now
         return self.value
+
+
+class Quantiles:
+    """Median and 99th percentile of the last 500 values."""
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=500)
+
+    def add(self, value: float) -> None:
+        """Takes note of a value."""
+        self._values.append(value)
+
+    def figures(self, name: str, unit: str) -> dict[str, float]:
+        """`NAME_p50_UNIT` and `NAME_p99_UNIT`; empty before the first value."""
+        if not self._values:
+            return {}
+        p50, p99 = np.percentile(list(self._values), (50, 99))
+        return {f"{name}_p50_{unit}": round(float(p50), 2), f"{name}_p99_{unit}": round(float(p99), 2)}
 
 
 def start_logging(level: int = logging.INFO) -> None:

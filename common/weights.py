@@ -15,6 +15,7 @@ from torch import Tensor
 
 from common.bus import Keys, NoAnswerError, RefusedError, Subscription, ask
 from common.messages import MessageError, Nothing, Version, WeightsBlob
+from common.telemetry import Quantiles
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +43,7 @@ class WeightsPuller:
     def __init__(self, session: zenoh.Session, keys: Keys, kind: str, rest: float = 0.0) -> None:
         """`rest` is the least time between two pulls, s."""
         self.newest: tuple[Version, dict[str, Tensor]] | None = None
+        self.latency = Quantiles()
         self._session, self._key, self._rest = session, keys.weights(kind), rest
         self._heard: queue.SimpleQueue[Version] = queue.SimpleQueue()
         self._subscription = Subscription(session, keys.version, Version, self._heard.put)
@@ -58,8 +60,10 @@ class WeightsPuller:
             time.sleep(self._rest)
 
     def _pull(self) -> None:
+        began = time.monotonic()
         try:
             blob = ask(self._session, self._key, Nothing(), WeightsBlob, timeout=10.0)
             self.newest = blob.version, unpack(blob)
+            self.latency.add(1000 * (time.monotonic() - began))
         except (NoAnswerError, RefusedError, MessageError, zenoh.ZError) as error:
             log.info("no weights: %s", error)

@@ -6,29 +6,29 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 import zenoh
 
-from common.bus import Keys, QueryServer, announce, serve
+from common.access import LOCAL
+from common.bus import Keys, Member, announce, serve
 from common.config import Config
 from common.contract import check_digest
-from common.delivery import unpack_header
+from common.delivery import Receiver
 from common.errors import UsageError
 from common.messages import (
-    Acknowledgement,
     Candidates,
     Message,
+    Origin,
     Outcome,
     Proposals,
     TaskQuery,
+    Version,
     decode,
-    encode,
 )
-from common.telemetry import Reporter
+from common.telemetry import Reporter, stop_on_signals
 from common.weights import WeightsPuller
 from curriculum.curriculum import Curriculum
 
@@ -48,6 +48,7 @@ class CurriculumService:
         config: Config,
         digest: dict[str, str] | None,
         folder: Path | None,
+        group: str = LOCAL,
     ) -> None:
         torch.set_num_threads(1)
         self.curriculum = Curriculum(config)
@@ -57,22 +58,22 @@ class CurriculumService:
         self._digest = digest
         self._lock = threading.Lock()
         keys = Keys(run)
-        self._token = announce(session, keys, "curriculum", "curriculum")
+        member = Member("curriculum", group, "curriculum")
+        self._token = announce(session, keys, member)
         self._weights = (
             WeightsPuller(session, keys, "critic", CRITIC_REST_SECONDS) if digest is not None else None
         )
         self._servers = [
             serve(session, keys.task, TaskQuery, self._propose),
-            QueryServer(session, keys.result, partial(self._take, Outcome, self.curriculum.report)),
-            QueryServer(session, keys.candidates, partial(self._take, Candidates, self.curriculum.add)),
+            self._receiver(session, keys.result, Outcome, self.curriculum.report),
+            self._receiver(session, keys.candidates, Candidates, self.curriculum.add),
         ]
-        self._reporter = Reporter(session, keys, "curriculum", "curriculum")
+        self._reporter = Reporter(session, keys, member)
 
     def run(self) -> None:
-        """Serves until SystemExit; keeps weights fresh, reports and saves meanwhile."""
-        saved = time.monotonic()
-        while True:
-            time.sleep(0.2)
+        """Serves until SIGTERM or SIGINT; keeps weights fresh, reports and saves meanwhile."""
+        saved, stopping = time.monotonic(), stop_on_signals()
+        while not stopping.wait(0.2):
             newest = self._weights.newest if self._weights else None
             if newest is not None and self.curriculum.critic.version != newest[0]:
                 try:
@@ -104,30 +105,29 @@ class CurriculumService:
         with self._lock:
             return Proposals(tasks=[self.curriculum.propose(query.cell, query.t) for _ in range(query.count)])
 
-    def _take(
-        self, kind: type[Report], add: Callable[[Report], None], payload: bytes, attachment: bytes
-    ) -> bytes:
-        """Acknowledges a delivered message after `add` has taken it; one that came before changes nothing."""
-        origin = unpack_header(attachment, payload)
-        message = decode(kind, payload)
-        if self._digest is not None:
-            check_digest(self._digest, message.digest)
-        with self._lock:
-            duplicate = self.curriculum.seen.seen(origin)
-            if not duplicate:
+    def _receiver(
+        self, session: zenoh.Session, channel: str, kind: type[Report], add: Callable[[Report], None]
+    ) -> Receiver:
+        def take(origin: Origin, payload: bytes) -> None:
+            message = decode(kind, payload)
+            if self._digest is not None:
+                check_digest(self._digest, message.digest)
+            with self._lock:
                 add(message)
                 self.curriculum.seen.add(origin)
-        return encode(Acknowledgement(duplicate=duplicate))
+
+        return Receiver(session, channel, take, self.curriculum.seen.seen, kind.max_bytes)
 
     def _report(self) -> None:
-        state = self.curriculum
+        state, version = self.curriculum, self.curriculum.critic.version or Version()
         values: dict[str, float | int | str] = {
             "candidates": len(state.store),
             "outcomes": state.outcomes,
             "gate_open": int(state.gate.open),
             "gate_success": round(sum(state.gate.outcomes) / max(len(state.gate.outcomes), 1), 3),
             "fits": state.network.fits,
-            "weights": state.critic.version.counter if state.critic.version else 0,
+            "weights": f"{version.epoch}.{version.counter}",
+            "inbox": sum(map(len, self._servers)),
             "refused": sum(sum(server.refused.values()) for server in self._servers),
             **{f"proposed_{name}": count for name, count in dict(state.proposed).items()},
         }

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from actor.frames import PROBE_SETS, film_all, probe_tasks
-from common.bus import open_hub
+from common.bus import Link, open_hub
 from common.config import Config
 from common.encoders import ENCODER, HEADS, pack_encoder, read_encoder
 from common.errors import UsageError
@@ -44,22 +44,22 @@ def gather(
     folder: Path,
     name: str,
     actors: int,
-    address: str,
+    link: Link,
     progress: Report,
     say: Callable[[str], None],
 ) -> None:
-    """Fills a store from actors on this machine, and any others that connect to `address`.
+    """Fills a store from actors on this machine, and any others that connect to `link`.
 
     Raises UsageError when the store cannot be written to; what it holds stays.
     """
     supervisor = Supervisor(say)
     spool = folder / "spool"
-    here = address.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+    here = str(link).replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
     try:
         for i in range(actors):
             actor = ["actor", "--connect", here, "--name", f"local-{i}", "--spool", str(spool), "--insecure"]
             supervisor.add(Child(f"local-{i}", lambda a=actor: a, folder / "logs" / f"local-{i}.log"))  # type: ignore[misc]
-        with open_hub(address) as session:
+        with open_hub(link) as session:
             receiver = FrameReceiver(session, name, store)
             try:
                 while not store.complete:

@@ -19,20 +19,22 @@ import torch
 import zenoh
 from torch.utils.tensorboard import SummaryWriter
 
-from common.bus import BUSY, Keys, QueryServer, announce, publish, serve
+from common.access import LOCAL
+from common.bus import BUSY, Keys, Member, QueryServer, announce, publish, serve
 from common.contract import check_digest, make_contract
-from common.delivery import unpack_header
+from common.delivery import Receiver
 from common.encoders import unpack_encoder
 from common.errors import RunError, UsageError
 from common.files import write_atomically
+from common.members import Members
 from common.messages import (
     ENDINGS,
-    Acknowledgement,
     ContractReply,
     Episode,
     Message,
     MessageError,
     Nothing,
+    Origin,
     Version,
     decode,
     encode,
@@ -113,12 +115,15 @@ class Progress:
 class LearnerService:
     """One learner; owns the log, the replay with its tree, the networks and the run directory."""
 
-    def __init__(self, session: zenoh.Session, run: RunDirectory, minutes: float = math.inf) -> None:
+    def __init__(
+        self, session: zenoh.Session, run: RunDirectory, minutes: float = math.inf, group: str = LOCAL
+    ) -> None:
         config = run.config
         torch.set_num_threads(learner_threads(config.learner.threads, os.cpu_count() or 1))
         self.config, self.run_directory, self._session = config, run, session
         self.keys = Keys(run.name)
-        self._token = announce(session, self.keys, "learner", "learner")
+        member = Member("learner", group, "learner")
+        self._token = announce(session, self.keys, member)
         self._minutes = minutes
         self._check_memory()
         self.learner = Learner(config)
@@ -140,13 +145,18 @@ class LearnerService:
         self._blobs_lock = threading.Lock()
         self._publish()
         self._snapshot_due = self._next_snapshot()
+        seen, commit = self._log.seen.seen, self._log.commit
+        self._receiver = Receiver(
+            session, self.keys.trajectory, self._take, seen, Episode.max_bytes, commit=commit
+        )
         self._servers = [
-            QueryServer(session, self.keys.trajectory, self._take, commit=self._log.commit),
+            self._receiver,
             serve(session, self.keys.contract, Nothing, self._answer_contract),
-            QueryServer(session, self.keys.weights("policy"), lambda *_: self._answer_weights("policy")),
-            QueryServer(session, self.keys.weights("critic"), lambda *_: self._answer_weights("critic")),
+            QueryServer(session, self.keys.weights("policy"), partial(self._answer_weights, "policy")),
+            QueryServer(session, self.keys.weights("critic"), partial(self._answer_weights, "critic")),
         ]
-        self._reporter = Reporter(session, self.keys, "learner", "learner")
+        self._reporter = Reporter(session, self.keys, member)
+        self._members = Members(session, self.keys, log.info)
         self._board: SummaryWriter | None = None
         self._began: float | None = None
         self._ended = time.monotonic()
@@ -258,14 +268,11 @@ class LearnerService:
                     f"cannot write to the run directory {self.run_directory.folder}: {error.strerror}"
                 ) from None
 
-    def _take(self, payload: bytes, attachment: bytes) -> bytes:
+    def _take(self, origin: Origin, payload: bytes) -> None:
         """From the bus, in a thread of its own: an episode is acknowledged when it is in the log.
 
         It is sent again later when the disk is full, or when the limiter holds the actors back.
         """
-        origin = unpack_header(attachment, payload)
-        if self._log.seen.seen(origin):
-            return encode(Acknowledgement(duplicate=True))
         episode = decode(Episode, payload)
         check_digest(self.contract.digest, episode.digest)
         world = self.config.world
@@ -280,7 +287,6 @@ class LearnerService:
             raise MessageError(BUSY) from None
         self._accepted += episode.length
         self._inbox.put((episode, record.env_steps - record.length))
-        return encode(Acknowledgement())
 
     def _ingest(self) -> None:
         while not self._inbox.empty():
@@ -345,7 +351,8 @@ class LearnerService:
             self._blobs = blobs
         publish(self._session, self.keys.version, version)
 
-    def _answer_weights(self, kind: str) -> bytes:
+    def _answer_weights(self, kind: str, payload: bytes, *_: bytes | str) -> bytes:
+        decode(Nothing, payload)
         with self._blobs_lock:
             return self._blobs[kind]
 
@@ -376,6 +383,13 @@ class LearnerService:
             "failed_writes": self._failed_writes,
             "elapsed_s": round(time.monotonic() - self._began, 1) if self._began else 0.0,
             "refused": sum(sum(server.refused.values()) for server in self._servers),
+            "duplicates": self._receiver.duplicates,
+            "inbox": len(self._receiver) + self._inbox.qsize(),
+            "weights": f"{self._epoch}.{self.updates}",
+            "publish_s": self.config.learner.publish_seconds,
+            "members": len(self._members.alive),
         }
+        if self._failed_writes:
+            values["failed_s"] = round(time.monotonic() - self._complained, 1)
         values |= {name: round(value, 5) for name, value in self.progress.figures().items()}
         self._reporter.report(values)

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 from hypothesis import HealthCheck, settings
 
-from common.bus import open_client, open_hub
+from common.bus import make_link, open_client, open_hub
 from tests.crew import Crew
 from tests.helpers import free_endpoint
 
@@ -28,14 +28,14 @@ def endpoint() -> str:
 @pytest.fixture
 def hub(endpoint: str) -> Iterator[zenoh.Session]:
     """A hub that listens on `endpoint`."""
-    with open_hub(endpoint) as session:
+    with open_hub(make_link(endpoint)) as session:
         yield session
 
 
 @pytest.fixture
 def client(endpoint: str, hub: zenoh.Session) -> Iterator[zenoh.Session]:
     """A client of `hub`."""
-    with open_client(endpoint, patience=10.0) as session:
+    with open_client(make_link(endpoint), patience=10.0) as session:
         yield session
 
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from common.bus import Keys, Subscription, open_client
+from common.access import LOCAL
+from common.bus import Keys, Member, Subscription, make_link, open_client
+from common.members import Members
 from common.messages import Stat, Version
-from deploy.screen import Monitor
 from learner.log import EpisodeLog, Record
 from tests.helpers import free_endpoint, wait_until
 
@@ -27,7 +28,7 @@ RESUMED = re.compile(
     r"resumed with (\d+) episodes \((\d+) steps\), (\d+) transitions in the replay, (\d+) up"
 )
 Id = tuple[str, str, int]
-"""Actor, boot and number of an episode."""
+"""Address of the actor, boot and number of an episode."""
 
 
 class Processes:
@@ -93,13 +94,13 @@ class Crew(Processes):
     def listening(self) -> Iterator[zenoh.Session]:
         """Hears all that is said, over every life of the hub."""
         keys = Keys("run")
-        with open_client(self.endpoint, patience=60) as session:
-            self.monitor = Monitor(session, keys)
+        with open_client(make_link(self.endpoint), patience=60) as session:
+            self.monitor = Members(session, keys)
             self._heard = (
                 Subscription(session, keys.version, Version, self.versions.append),
                 Subscription(
                     session,
-                    keys.stat("learner", "*"),
+                    keys.stat(Member("learner", "*", "*")),
                     Stat,
                     lambda stat: self.reports[stat.pid].append(stat.values),
                 ),
@@ -127,7 +128,7 @@ class Crew(Processes):
         self.running[name].wait(15)
         if name in "ab":
             self.made[name] += _made(self.monitor.of("actor").get(name, {}))
-            self.monitor.stats.pop(("actor", name), None)
+            self.monitor.stats.pop(Member("actor", LOCAL, name), None)
 
     def log(self) -> list[Record]:
         """What is in the log now, read from a copy."""
@@ -138,13 +139,18 @@ class Crew(Processes):
 
     def waiting(self) -> set[Id]:
         """Episodes in the spools of the actors, from all their lives."""
-        files = self.spool.glob("*/learner/*/*.msg")
-        return {(file.parts[-4], file.parts[-2], int(file.stem)) for file in files}
+        files = self.spool.glob("*/*/learner/*/*.msg")
+        return {("/".join(file.parts[-5:-3]), file.parts[-2], int(file.stem)) for file in files}
 
     def newest_checkpoint(self) -> Path | None:
         """Of those that are whole."""
         found = sorted(p for p in (self.run / "checkpoints").glob("*") if p.suffix != ".part")
         return found[-1] if found else None
+
+
+def address(name: str) -> str:
+    """Under which an actor of that name delivers."""
+    return f"{LOCAL}/{name}"
 
 
 def _made(figures: dict) -> int:
@@ -169,7 +175,7 @@ def assert_nothing_is_lost_and_nothing_there_twice(crew: Crew) -> list[Record]:
     # nor are the last ones of a life missing, of which the gaps above know nothing
     for name in "ab":
         told = crew.made[name] + _made(crew.monitor.of("actor").get(name, {}))
-        assert told <= sum(len(those) for (actor, _), those in numbers.items() if actor == name)
+        assert told <= sum(len(those) for (actor, _), those in numbers.items() if actor == address(name))
         assert told > 0
     steps = np.cumsum([r.length for r in records])
     assert [r.env_steps for r in records] == list(steps)

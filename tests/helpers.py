@@ -1,4 +1,4 @@
-"""Small things that several tests need: free ports, waiting with a deadline, episodes, shapely's polygons."""
+"""Small things that several tests need: free ports, waiting, deliveries, episodes, shapely's polygons."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import math
 import resource
 import signal
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import zenoh
 from shapely import Polygon
 
+from common.bus import ask_bytes
 from common.config import Config, resolve
+from common.delivery import Parcel, pack_bundle
 from common.geometry import SE2, Rectangle
-from common.messages import Ending, Episode, Version
+from common.messages import Ending, Episode, Message, Origin, Receipt, Version, decode, encode
 from common.observation import ACTION_SIZE, ObservationLayout
 from common.tasks import Task
 from deploy.launcher import free_port
@@ -38,6 +42,46 @@ def wait_until(condition: Callable[[], Any], timeout: float = 10.0, what: str = 
             raise AssertionError(f"{what} did not come true within {timeout} s")
         time.sleep(0.005)
     return value
+
+
+STORED = Receipt(answers=[""])
+"""What is said of one message that the receiver has, now or from before."""
+
+
+def parcel(
+    payload: bytes | Message, seq: int, boot: str = "b1", address: str = "local/a1", crc: int | None = None
+) -> Parcel:
+    """A message as an actor sends it; with another checksum than its own when told so."""
+    content = payload if isinstance(payload, bytes) else encode(payload)
+    origin = Origin(actor=address, boot=boot, seq=seq)
+    return Parcel(origin, zlib.crc32(content) if crc is None else crc, content)
+
+
+def deliver_all(
+    session: zenoh.Session, channel: str, parcels: list[Parcel], address: str = "local/a1"
+) -> Receipt:
+    """Sends messages in one delivery; raises what `ask_bytes` raises."""
+    payload, attachment = pack_bundle(parcels)
+    return decode(Receipt, ask_bytes(session, f"{channel}/{address}", payload, attachment, timeout=30.0))
+
+
+def deliver(
+    session: zenoh.Session,
+    channel: str,
+    message: Message | bytes,
+    seq: int,
+    boot: str = "b1",
+    address: str = "local/a1",
+) -> Receipt:
+    """Sends one message as an actor does, and again under the same number if called again."""
+    return deliver_all(session, channel, [parcel(message, seq, boot, address)], address)
+
+
+def reason(receipt: Receipt) -> str:
+    """Why the one message was refused, which it must have been."""
+    (found,) = receipt.answers
+    assert found, "it was not refused"
+    return found
 
 
 @contextmanager

@@ -1,6 +1,7 @@
-"""`navaclq bench learner` and `replay`: rows, rivals and ratios; the figures themselves decide nothing."""
+"""`navaclq bench bus`, `learner`, `replay`: rows, rivals, ratios; the figures themselves decide nothing."""
 
 import builtins
+import importlib.util
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from common.config import resolve
 from common.observation import ObservationLayout
+from deploy.bench import bus
 from deploy.bench import replay as bench
 from deploy.cli.main import run
 from learner.learner import Learner
@@ -81,3 +83,33 @@ def test_bench_learner_compares_with_stable_baselines3_and_the_products_on_one_a
     expected = rows["navaclq, 1 thread(s)"] / rows["sb3, 1 thread(s)"]
     assert ratios["over_sb3_1_thread"] == pytest.approx(expected, rel=0.01)
     assert ratios["over_matmul_limit"] < 1.5
+
+
+def test_bench_bus_compares_acknowledged_delivery_and_loads_a_learner_that_loses_nothing(monkeypatch, capsys):
+    for constant, value in (
+        ("VOLUME", 1),
+        ("LEAST", 4),
+        ("SMALL_COUNT", 40),
+        ("WINDOW", 0.2),
+        ("PROCESSES", 1),
+    ):
+        monkeypatch.setattr(bus, constant, value)
+    found, rows = navaclq(monkeypatch, capsys, "bus", "--rounds", 1, "--load", 2, "--seconds", 0.2)
+    if importlib.util.find_spec("zmq"):
+        assert rows["zmq_512k"] > 0 and found["ratios"]["acked_over_zmq_512k"] > 0
+    else:
+        assert found["skipped"] == ["zmq: No module named 'zmq'; pip install 'navaclq[bench]'"]
+    for size in bus.SIZES:
+        for durability in ("process", "host"):  # of one round: what the rows say
+            expected = rows[f"acked_{durability}_{size}"] / rows[f"bare_query_{size}"]
+            ratio = found["ratios"][f"acked_{durability}_over_bare_query_{size}"]
+            assert ratio == pytest.approx(expected, rel=0.01, abs=0.001)
+        volume = rows[f"put_{size}"] * bus.SIZES[size] / 1e6
+        assert 0.98 * volume < rows[f"put_{size}_volume"] <= volume
+        assert rows[f"spooled_{size}"] > 0
+    gain = rows["bundled_4k"] / rows["single_4k"]
+    assert found["ratios"]["bundled_over_single_4k"] == pytest.approx(gain, rel=0.01, abs=0.001)
+    assert rows["load_sent"] > 0
+    assert rows["load_lost"] == rows["load_stored_twice"] == rows["load_refused"] == 0
+    assert rows["load_acknowledged_p50"] <= rows["load_acknowledged_p99"]
+    assert found["ratios"]["load_over_ingest_limit"] > 0

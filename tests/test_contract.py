@@ -11,7 +11,7 @@ from common.contract import (
 )
 from common.encoders import pack_encoder, unpack_encoder
 from common.errors import UsageError
-from common.messages import ContractReply, MessageError, decode, encode
+from common.messages import PROTOCOL, ContractReply, MessageError, decode, encode
 from common.networks import make_encoder
 
 CONFIG = resolve("smoke", seed=3)
@@ -100,6 +100,10 @@ def test_digest_does_not_change_when_a_cells_walls_have_been_looked_at():
     before = digest(CONFIG, b"weights")
     assert all(cell.solids and cell.walls and cell.edges for cell in CELLS)
     assert digest(CONFIG, b"weights") == before
+
+
+def test_digest_names_the_protocol_of_the_bus():
+    assert digest(CONFIG, b"weights")["protocol"] == str(PROTOCOL)
 
 
 def test_digest_of_a_frozen_encoder_is_that_of_its_weights():

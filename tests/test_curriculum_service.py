@@ -8,23 +8,31 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
-from common.bus import Keys, QueryServer, RefusedError, ask, ask_bytes, open_client, open_hub, publish
+from common.bus import (
+    INTERNAL_ERROR,
+    Keys,
+    Member,
+    QueryServer,
+    RefusedError,
+    ask,
+    ask_bytes,
+    make_link,
+    open_client,
+    open_hub,
+    publish,
+)
 from common.config import Config
 from common.contract import make_contract
-from common.delivery import Sender, Spool, pack_header
+from common.delivery import DAMAGED, Sender, Spool, pack_bundle
 from common.encoders import pack_encoder
 from common.errors import UsageError
 from common.messages import (
-    Acknowledgement,
     Candidates,
-    Message,
-    Origin,
     Outcome,
     Proposal,
     Proposals,
     TaskQuery,
     Version,
-    decode,
     encode,
 )
 from common.networks import make_encoder
@@ -32,7 +40,7 @@ from common.weights import pack
 from curriculum.service import CurriculumService
 from deploy.cli.main import app
 from learner.sac import SAC
-from tests.helpers import small_config, wait_until
+from tests.helpers import STORED, deliver, deliver_all, parcel, reason, small_config, wait_until
 from tests.test_curriculum import make_candidate
 
 CONFIG = small_config("curriculum.gate.window=4")
@@ -61,13 +69,6 @@ def started(hub: zenoh.Session) -> Iterator[Callable[..., CurriculumService]]:
 
 def query(client: zenoh.Session, cell: int = 0, count: int = 1, key: str = KEYS.task) -> list[Proposal]:
     return ask(client, key, TaskQuery(cell=cell, t=0, count=count), Proposals).tasks
-
-
-def deliver(client: zenoh.Session, key: str, message: Message, seq: int, boot: str = "b1") -> Acknowledgement:
-    """Sends a message as an actor does, and again under the same number if called again."""
-    payload = encode(message)
-    header = pack_header(Origin(actor="a1", boot=boot, seq=seq), payload)
-    return decode(Acknowledgement, ask_bytes(client, key, payload, header))
 
 
 def outcome_of(proposal: Proposal, success: bool = True, digest: dict[str, str] = DIGEST) -> Outcome:
@@ -102,11 +103,16 @@ def test_five_tasks_are_proposed_at_once_and_by_a_query_that_does_not_know_the_r
     [b"", b"junk" * 100, encode(TaskQuery(cell=1))[:-3], b"\x93\x01\xa9TaskQuery\x81\xa4cell\x63"],
 )
 def test_malformed_queries_are_refused_and_the_service_goes_on(client, started, payload):
-    started()
-    for key in (KEYS.task, KEYS.result, KEYS.candidates):
-        with pytest.raises(RefusedError):
-            ask_bytes(client, key, payload)
+    service = started()
+    with pytest.raises(RefusedError):
+        ask_bytes(client, KEYS.task, payload)
+    for channel in (KEYS.result, KEYS.candidates):
+        with pytest.raises(RefusedError, match=r"^header: "):
+            ask_bytes(client, f"{channel}/local/a1", payload)
+        assert reason(deliver(client, channel, payload, 0)) not in ("BUSY", INTERNAL_ERROR)
     assert len(query(client, count=2)) == 2
+    assert [sum(server.refused.values()) for server in service._servers] == [1, 2, 2]
+    assert (service.curriculum.outcomes, len(service.curriculum.store)) == (0, 0)
 
 
 def test_impossible_cell_is_refused_with_the_reason(client, started):
@@ -119,29 +125,53 @@ def test_impossible_cell_is_refused_with_the_reason(client, started):
 def test_outcome_is_acknowledged_and_a_duplicate_counts_once(client, started):
     service = started()
     proposals = query(client, count=2)
-    assert not deliver(client, KEYS.result, outcome_of(proposals[0]), 0).duplicate
+    assert deliver(client, KEYS.result, outcome_of(proposals[0]), 0) == STORED
     assert service.curriculum.outcomes == 1
     for _ in range(3):
-        assert deliver(client, KEYS.result, outcome_of(proposals[0]), 0).duplicate
+        assert deliver(client, KEYS.result, outcome_of(proposals[0]), 0) == STORED
+    assert duplicates(service) == [3, 0]
     assert service.curriculum.outcomes == 1
     assert list(service.curriculum.gate.outcomes) == [True]
-    assert not deliver(client, KEYS.result, outcome_of(proposals[1], success=False), 1).duplicate
-    assert not deliver(client, KEYS.result, outcome_of(proposals[1]), 0, boot="b2").duplicate
+    assert deliver(client, KEYS.result, outcome_of(proposals[1], success=False), 1) == STORED
+    assert deliver(client, KEYS.result, outcome_of(proposals[1]), 0, boot="b2") == STORED
     assert list(service.curriculum.gate.outcomes) == [True, False, True]
+    assert duplicates(service) == [3, 0]
+
+
+def duplicates(service: CurriculumService) -> list[int]:
+    """Of outcomes and of candidates."""
+    return [server.duplicates for server in service._servers[1:]]
+
+
+def test_outcomes_that_come_together_are_taken_one_by_one(client, started):
+    service = started(digest=DIGEST)
+    good, again, foreign, other = query(client, count=4)
+    messages = [
+        (outcome_of(good), 0),
+        (outcome_of(foreign, digest=DIGEST | {"reward": "0123"}), 1),
+        (outcome_of(other, success=False), 2),
+        (outcome_of(again), 0),
+    ]
+    receipt = deliver_all(client, KEYS.result, [parcel(message, seq) for message, seq in messages])
+    assert receipt.answers[0] == receipt.answers[2] == receipt.answers[3] == ""
+    assert "contract differs in 'reward'" in receipt.answers[1]
+    assert list(service.curriculum.gate.outcomes) == [True, False]
+    assert duplicates(service) == [1, 0]
 
 
 def test_outcomes_open_the_gate_for_the_next_query(client, started):
     started()
     for seq, proposal in enumerate(query(client, count=4)):
         assert proposal.category == "gate"
-        deliver(client, KEYS.result, outcome_of(proposal), seq)
+        assert deliver(client, KEYS.result, outcome_of(proposal), seq) == STORED
     assert query(client)[0].category != "gate"
 
 
 def test_candidates_are_stored_once_and_proposed(client, started):
     service = started(OPEN)
     message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed, cell=2) for seed in range(4)])
-    assert [deliver(client, KEYS.candidates, message, 7).duplicate for _ in range(2)] == [False, True]
+    assert [deliver(client, KEYS.candidates, message, 7) for _ in range(2)] == [STORED, STORED]
+    assert duplicates(service) == [0, 1]
     assert service.curriculum.store.count(2) == 4
     assert sorted(p.task.seed for p in query(client, cell=2, count=4)) == [0, 1, 2, 3]
     assert service.curriculum.store.count(2) == 0
@@ -151,11 +181,12 @@ def test_candidate_of_another_layout_is_refused_and_the_service_goes_on(client, 
     service = started(OPEN)
     other = small_config("world.camera.size=32")
     message = Candidates(digest={}, candidates=[make_candidate(other, 0)])
-    with pytest.raises(RefusedError, match=r"candidate visual is float16 \(16,\), expected float16 \(4,\)"):
-        deliver(client, KEYS.candidates, message, 0)
+    refused = reason(deliver(client, KEYS.candidates, message, 0))
+    assert "candidate visual is float16 (16,), expected float16 (4,)" in refused
     assert len(service.curriculum.store) == 0
     good = Candidates(digest={}, candidates=[make_candidate(OPEN, 0)])
-    assert not deliver(client, KEYS.candidates, good, 1).duplicate
+    assert deliver(client, KEYS.candidates, good, 1) == STORED
+    assert len(service.curriculum.store) == 1
 
 
 @pytest.mark.parametrize("field", ["protocol", "encoder", "observation", "dynamics", "reward"])
@@ -167,25 +198,40 @@ def test_message_of_a_foreign_contract_is_refused_naming_the_field(client, start
         (KEYS.result, outcome_of(proposal, digest=foreign)),
         (KEYS.candidates, Candidates(digest=foreign, candidates=[make_candidate(CONFIG, 0)])),
     ):
-        with pytest.raises(RefusedError, match=f"contract differs in '{field}': .* got 0123"):
-            deliver(client, key, message, 0)
+        refused = reason(deliver(client, key, message, 0))
+        assert refused.startswith(f"contract differs in '{field}': ")
+        assert refused.endswith(" got 0123")
     assert (service.curriculum.outcomes, len(service.curriculum.store)) == (0, 0)
-    assert not deliver(client, KEYS.result, outcome_of(proposal), 0).duplicate, "a refusal uses no number up"
+    assert deliver(client, KEYS.result, outcome_of(proposal), 0) == STORED
+    assert duplicates(service) == [0, 0], "a refusal uses no number up"
     assert service.curriculum.outcomes == 1
 
 
 def test_damaged_payload_is_refused(client, started):
     service = started()
-    payload = encode(outcome_of(query(client)[0]))
-    header = pack_header(Origin(actor="a1", boot="b1", seq=0), payload + b"x")
-    with pytest.raises(RefusedError, match="payload damaged"):
-        ask_bytes(client, KEYS.result, payload, header)
+    whole = parcel(outcome_of(query(client)[0]), 0)
+    flipped = whole.payload[:-1] + bytes([whole.payload[-1] ^ 1])
+    assert deliver_all(client, KEYS.result, [whole._replace(payload=flipped)]).answers == [DAMAGED]
+    payload, header = pack_bundle([whole])
+    with pytest.raises(RefusedError, match=r"^header: 1 messages of \d+ bytes, got \d+$"):
+        ask_bytes(client, f"{KEYS.result}/local/a1", payload + b"x", header)
     assert service.curriculum.outcomes == 0
+    assert deliver_all(client, KEYS.result, [whole]) == STORED
+    assert service.curriculum.outcomes == 1
+
+
+def test_outcome_under_anothers_name_is_refused(client, started):
+    service = started()
+    outcome = parcel(outcome_of(query(client)[0]), 0, address="local/a2")
+    with pytest.raises(RefusedError, match="under another's name: local/a2"):
+        deliver_all(client, KEYS.result, [outcome], "local/a1")
+    assert service.curriculum.outcomes == 0
+    assert deliver_all(client, KEYS.result, [outcome], "local/a2") == STORED
 
 
 def test_actors_spool_is_emptied_by_the_service(client, started, tmp_path):
     service = started()
-    sender = Sender(client, Spool(tmp_path / "spool", 2.0**20), "a1", "b1")
+    sender = Sender(client, Spool(tmp_path / "spool", 2.0**20), Member("actor", "local", "a1"), "b1")
     for proposal in query(client, count=6):
         sender.put(KEYS.result, outcome_of(proposal, success=False))
     wait_until(lambda: sender.sent == 6, what="all outcomes acknowledged")
@@ -196,15 +242,16 @@ def test_actors_spool_is_emptied_by_the_service(client, started, tmp_path):
 def test_restarted_service_remembers_outcomes_and_what_came_before(client, started, tmp_path):
     first = started(folder=tmp_path / "curriculum")
     for seq, proposal in enumerate(query(client, count=3)):
-        deliver(client, KEYS.result, outcome_of(proposal), seq)
+        assert deliver(client, KEYS.result, outcome_of(proposal), seq) == STORED
     (waiting,) = query(client)
     first.close()
     first._token.undeclare()
     second = started(folder=tmp_path / "curriculum")
     assert second.curriculum.outcomes == 3
     assert not second.curriculum.gate.open
-    assert deliver(client, KEYS.result, outcome_of(waiting), 2).duplicate, "its acknowledgement had got lost"
-    assert not deliver(client, KEYS.result, outcome_of(waiting), 3).duplicate
+    assert deliver(client, KEYS.result, outcome_of(waiting), 2) == STORED
+    assert duplicates(second) == [1, 0], "its acknowledgement had got lost"
+    assert deliver(client, KEYS.result, outcome_of(waiting), 3) == STORED
     assert second.curriculum.outcomes == 4
     assert second.curriculum.gate.open
 
@@ -218,7 +265,7 @@ def test_second_curriculum_of_a_run_is_refused(started):
 @contextmanager
 def running(endpoint: str) -> Iterator[CurriculumService]:
     """A service that runs until its session is closed."""
-    with open_hub(endpoint) as hub:
+    with open_hub(make_link(endpoint)) as hub:
         service = CurriculumService(hub, "run-1", OPEN, DIGEST, None)
 
         def run() -> None:
@@ -235,10 +282,10 @@ def running(endpoint: str) -> Iterator[CurriculumService]:
 def test_q_follows_the_weights_that_the_learner_publishes(endpoint):
     sac, version = SAC(OPEN), Version(epoch=1, counter=5)
     weights = {"blob": encode(pack(version, sac.critic_state()))}
-    with running(endpoint) as service, open_client(endpoint, patience=10.0) as client:
+    with running(endpoint) as service, open_client(make_link(endpoint), patience=10.0) as client:
         _learner = QueryServer(client, KEYS.weights("critic"), lambda *_: weights["blob"])
         message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed) for seed in range(2)])
-        deliver(client, KEYS.candidates, message, 0)
+        assert deliver(client, KEYS.candidates, message, 0) == STORED
         for newer in (version, Version(epoch=2, counter=0)):
             weights["blob"] = encode(pack(newer, sac.critic_state()))
             publish(client, KEYS.version, newer)

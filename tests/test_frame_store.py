@@ -52,8 +52,13 @@ def origin(seq: int, boot: str = "b1") -> Origin:
 
 
 def add(store: FrameStore, index: int, boot: str = "b1") -> bool:
+    """Adds a drive as the receiver of frames does; False when it was there before."""
     message = drive(index)
-    return store.add(origin(index, boot), message, encode(message))
+    if store.seen(origin(index, boot)):
+        return False
+    store.add(origin(index, boot), message, encode(message))
+    assert store.seen(origin(index, boot))
+    return True
 
 
 def filled(folder: Path, count: int, config: Config | None = None) -> FrameStore:

@@ -6,6 +6,8 @@ import time
 
 import pytest
 
+from common.access import LOCAL
+from common.bus import Member
 from common.delivery import Sender, Spool
 from common.messages import Episode, decode
 from tests.crew import RESUMED, Crew, assert_nothing_is_lost_and_nothing_there_twice, ids, losses_of
@@ -119,12 +121,13 @@ def test_whoever_is_killed_whenever_in_the_end_everything_is_acknowledged(crew):
         left = [
             Spool(folder, 1e9)
             for name in "ab"
-            for folder in sorted((crew.spool / name).iterdir())
+            for folder in sorted((crew.spool / LOCAL / name).iterdir())
             if folder.is_dir()
         ]
         assert len(left) == 4
         for spool in left:
-            assert Sender(session, spool, spool.folder.parent.name, "last").close(patience=20) == 0
+            member = Member("actor", LOCAL, spool.folder.parent.name)
+            assert Sender(session, spool, member, "last").close(patience=20) == 0
         assert list(crew.spool.rglob("*.msg")) == list(crew.spool.rglob("*.bad")) == []
         for name in ("curriculum", "learner"):
             assert crew.stop(name) == 0, crew.words(name)

@@ -27,6 +27,7 @@ CONFIG = resolve("smoke")
 LAYOUT = ObservationLayout.of(CONFIG)
 
 names = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
+addresses = st.tuples(names, names).map("/".join)
 texts = st.text(max_size=32)
 categories = st.sampled_from(get_args(m.Category))
 counts = st.integers(0, 2**63)
@@ -67,7 +68,7 @@ proposals = st.builds(
 )
 candidates = st.builds(m.Candidate, task=tasks, visual=arrays, lidar=arrays)
 MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
-    m.Origin: st.builds(m.Origin, actor=names, boot=names, seq=counts),
+    m.Origin: st.builds(m.Origin, actor=names | addresses, boot=names, seq=counts),
     m.Version: versions,
     m.Episode: st.builds(
         m.Episode,
@@ -110,15 +111,23 @@ MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
     m.Stat: st.builds(
         m.Stat,
         role=names,
-        id=names,
+        group=names,
+        name=names,
         host=texts,
         pid=counts,
+        since=numbers,
+        code=texts,
+        protocol=counts,
         values=st.dictionaries(texts, st.integers(-(2**63), 2**63) | numbers | texts, max_size=9),
     ),
-    m.Acknowledgement: st.builds(m.Acknowledgement, duplicate=st.booleans()),
+    m.Receipt: st.builds(m.Receipt, answers=st.lists(texts, max_size=m.BUNDLE)),
     m.Nothing: st.builds(m.Nothing),
 }
 KINDS = list(MESSAGES)
+STAT: dict = {
+    **{"role": "r", "group": "g", "name": "n", "host": "h", "pid": 1},
+    **{"since": 1.7e9, "code": "1.0+ab", "protocol": m.PROTOCOL, "values": {}},
+}
 
 
 def assert_same(a: object, b: object) -> None:
@@ -197,7 +206,7 @@ def test_trailing_bytes_are_refused():
 
 @pytest.mark.parametrize("version", [0, 2, "1", None, [1], b"\x00" * 5000])
 def test_wrong_version_is_refused_in_a_short_sentence(version):
-    with pytest.raises(MessageError, match=r"schema version .*, this side speaks 1") as caught:
+    with pytest.raises(MessageError, match=r"schema version: .*, this side speaks 1") as caught:
         decode(m.Nothing, packed(m.Nothing, {}, version))
     assert len(str(caught.value)) < 120
 
@@ -233,13 +242,30 @@ def test_fields_that_are_no_mapping_are_refused(fields):
         (m.TaskQuery, {"cell": 0, "t": -1}, r"TaskQuery\.t: "),
         (m.TaskQuery, {"cell": 0, "count": 0}, r"TaskQuery\.count: "),
         (m.TaskQuery, {"cell": 0, "count": 1001}, r"TaskQuery\.count: "),
-        (m.Origin, {"actor": "a/b", "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "a/b/c", "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "a/", "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "/b", "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "a/*", "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "a/b\n", "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "a/" + "b" * 65, "boot": "b", "seq": 0}, r"Origin\.actor: "),
+        (m.Origin, {"actor": "a", "boot": "b/c", "seq": 0}, r"Origin\.boot: "),
         (m.Origin, {"actor": "a\n", "boot": "b", "seq": 0}, r"Origin\.actor: "),
         (m.Origin, {"actor": "", "boot": "b", "seq": 0}, r"Origin\.actor: "),
         (m.Origin, {"actor": "a" * 65, "boot": "b", "seq": 0}, r"Origin\.actor: "),
         (m.Origin, {"actor": "a", "boot": "**", "seq": 0}, r"Origin\.boot: "),
-        (m.Stat, {"role": "r", "id": "i", "host": "h", "pid": 1, "values": {"x": float("nan")}}, "values"),
-        (m.Stat, {"role": "r", "id": "i", "host": "h", "pid": 1, "values": {"x": [1]}}, "values"),
+        (m.Stat, STAT | {"values": {"x": float("nan")}}, "values"),
+        (m.Stat, STAT | {"values": {"x": [1]}}, "values"),
+        (m.Stat, STAT | {"values": {str(i): i for i in range(97)}}, r"Stat\.values"),
+        (m.Stat, STAT | {"since": float("inf")}, r"Stat\.since"),
+        (m.Stat, STAT | {"host": "h" * 129}, r"Stat\.host"),
+        (m.Stat, STAT | {"code": "c" * 65}, r"Stat\.code"),
+        (m.Stat, STAT | {"group": "a/b"}, r"Stat\.group"),
+        (m.Stat, STAT | {"name": "**"}, r"Stat\.name"),
+        (m.Stat, STAT | {"role": ""}, r"Stat\.role"),
+        (m.Stat, {key: value for key, value in STAT.items() if key != "protocol"}, r"Stat\.protocol"),
+        (m.Receipt, {"answers": [""] * (m.BUNDLE + 1)}, r"Receipt\.answers"),
+        (m.Receipt, {"answers": ["x" * 401]}, r"Receipt\.answers\.0"),
+        (m.Receipt, {"answers": [None]}, r"Receipt\.answers\.0"),
         (m.Candidates, {"digest": {str(i): "" for i in range(17)}, "candidates": []}, r"Candidates\.digest"),
     ],
 )
@@ -341,7 +367,7 @@ def test_malformed_arrays_are_refused_with_the_reason(array, said):
 
 
 def test_oversize_is_refused_before_sending_and_after_receiving():
-    big = m.Stat(role="r", id="i", host="h", pid=1, values={"x": "a" * m.Stat.max_bytes})
+    big = m.Stat(**STAT | {"values": {"x": "a" * m.Stat.max_bytes}})
     with pytest.raises(MessageError, match=r"Stat of \d+ bytes; at most 1048576 are allowed"):
         encode(big)
     with pytest.raises(MessageError, match="Nothing of 1048577 bytes; at most 1048576 are allowed"):

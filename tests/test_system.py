@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import Keys, RefusedError, ask_bytes, open_client
+from common.access import LOCAL
+from common.bus import Keys, Member, RefusedError, ask_bytes, make_link, open_client
 from common.contract import fetch_contract
-from common.delivery import pack_header
-from common.messages import Origin, encode
-from deploy.screen import Monitor
+from common.delivery import DAMAGED, pack_bundle
+from common.members import Members
 from tests.crew import SMOKE, Processes
-from tests.helpers import free_endpoint, tiny_episode, wait_until
+from tests.helpers import deliver, deliver_all, free_endpoint, parcel, reason, tiny_episode, wait_until
 
 
 @pytest.fixture
@@ -34,8 +34,8 @@ def test_four_processes_started_by_hand_train_and_survive_the_loss_of_one(proces
     processes.start("curriculum", "curriculum", "serve", "--run", run, *join)
     for name in ("a", "b"):
         processes.start(name, "actor", "--name", name, "--spool", tmp_path / "spool", *join)
-    with open_client(endpoint, patience=60) as session:
-        monitor = Monitor(session, Keys("hand"))
+    with open_client(make_link(endpoint), patience=60) as session:
+        monitor = Members(session, Keys("hand"))
 
         def learner(key):
             return monitor.learner.get(key, 0)
@@ -50,9 +50,10 @@ def test_four_processes_started_by_hand_train_and_survive_the_loss_of_one(proces
         # a third actor joins and its episodes count; killed, it is missed, and nothing else stops
         joined = processes.start("c", "actor", "--name", "c", "--spool", tmp_path / "spool", *join)
         wait_until(lambda: monitor.of("actor").get("c", {}).get("acknowledged", 0) > 3, 60, "actor c")
-        assert monitor.alive["actor", "c"]
+        third = Member("actor", LOCAL, "c")
+        assert third in monitor.alive
         joined.kill()
-        wait_until(lambda: not monitor.alive["actor", "c"], 15, "missing actor c")
+        wait_until(lambda: third not in monitor.alive, 15, "missing actor c")
         steps, updates = learner("env_steps"), learner("updates")
         wait_until(
             lambda: learner("env_steps") > steps + 100 and learner("updates") > updates, 60, "going on"
@@ -74,18 +75,18 @@ def test_four_processes_started_by_hand_train_and_survive_the_loss_of_one(proces
         from common.config import parse
 
         config, trajectory = parse(contract.config), Keys("hand").trajectory
-        foreign = encode(tiny_episode(config, digest=dict(contract.digest, encoder="0" * 16)))
-        origin = Origin(actor="x", boot="y", seq=0)
-        with pytest.raises(RefusedError, match="'encoder'"):
-            ask_bytes(session, trajectory, foreign, pack_header(origin, foreign))
+        foreign = parcel(tiny_episode(config, digest=dict(contract.digest, encoder="0" * 16)), 0)
+        assert "'encoder'" in reason(deliver(session, trajectory, foreign.payload, 0))
+        damaged = foreign._replace(payload=foreign.payload[:-9])
+        assert deliver_all(session, trajectory, [damaged]).answers == [DAMAGED]
         for garbage, header in (
             (b"garbage", b"header"),
             (b"", b""),
-            (foreign[:-9], pack_header(origin, foreign)),
+            (foreign.payload[:-9], pack_bundle([foreign])[1]),
         ):
-            with pytest.raises(RefusedError):
-                ask_bytes(session, trajectory, garbage, header)
-        wait_until(lambda: learner("refused") == 4, 10, "count of refusals")
+            with pytest.raises(RefusedError, match=r"^header: "):
+                ask_bytes(session, f"{trajectory}/local/a1", garbage, header)
+        wait_until(lambda: learner("refused") == 5, 10, "count of refusals")
 
         # one name, one process
         twin = processes.start("twin", "actor", "--name", "a", *join)
@@ -97,7 +98,7 @@ def test_four_processes_started_by_hand_train_and_survive_the_loss_of_one(proces
         assert processes.stop(name) == 0, processes.words(name)
     summary = json.loads((run / "summary.json").read_text())
     assert summary["episodes"] > 10
-    assert sum(summary["refused"].values()) == 4
+    assert sum(summary["refused"].values()) == 5
     assert (run / "snapshots" / "final" / "networks.safetensors").exists()
     assert not list(run.rglob("*.part"))
 

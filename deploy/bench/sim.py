@@ -219,8 +219,8 @@ class _Crew:
         episode = finished.message({}, Version(), Version(), "random")
         origin = Origin(actor="bench", boot="bench", seq=self._rollout.steps)
         self._spool.put(origin, "episode", encode_message(episode))
-        if waiting := self._spool.first():
-            self._spool.remove(waiting[0])
+        for waiting in self._spool.bundle(set())[1]:
+            self._spool.remove(waiting)
         self._rollout.look(slot, candidate_task(slot % len(CELLS), self._config, self._rng))
 
     def close(self) -> None:

@@ -21,6 +21,25 @@ def _group() -> None:
 
 
 @app.command()
+def bus(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; about 4 s each.")] = 20,
+    load: Annotated[
+        int, typer.Option(min=0, max=256, help="Actors that send to a real learner at full rate; 0: none.")
+    ] = 64,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long they send.")] = 12.0,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+) -> None:
+    """Acknowledged, logged delivery against bare Zenoh and ZeroMQ; a learner under load."""
+    resolved = options.configuration("fast", None, None, None, seed)
+    from deploy.bench.bus import bench_bus
+
+    with options.progress("rounds", rounds) as done:
+        report = bench_bus(resolved, rounds, load, seconds, done)
+    _print(report, as_json)
+
+
+@app.command()
 def encoder(
     frames: Annotated[Path, typer.Option(help="Folder of frames that `navaclq pretrain` has gathered.")],
     epochs: Annotated[int, typer.Option(min=1, help="Epochs for each size.")] = 4,

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import Keys, ask, check_endpoint, open_client, open_hub
+from common.bus import Keys, Link, ask, open_client, open_hub
 from common.cells import check_cell
 from common.errors import UsageError
 from common.messages import Proposals, TaskQuery
@@ -43,6 +43,7 @@ def serve_curriculum(
     config: options.ConfigFile = None,
     settings: options.Settings = None,
     seed: options.Seed = None,
+    certs: options.Certs = None,
     insecure: options.Insecure = False,
 ) -> None:
     """Answer task queries: beside a learner (--connect), or alone (--listen, the default)."""
@@ -60,22 +61,24 @@ def serve_curriculum(
     start_logging()
     exit_on_signals()
     if connect:
-        with open_client(check_endpoint(connect, insecure), say_waiting(f"the hub at {connect}")) as session:
+        link = options.make_link(connect, certs, insecure)
+        with open_client(link, say_waiting(f"the hub at {link}")) as session:
             contract = fetch_contract(session, say_waiting("a learner at the hub"))
             resolved = accept_contract(contract, tuple(settings or ()))
-            _serve(CurriculumService(session, contract.run, resolved, contract.digest, folder), connect)
+            service = CurriculumService(session, contract.run, resolved, contract.digest, folder, link.group)
+            _serve(service, link)
     else:
-        address = check_endpoint(listen or options.DEFAULT_ENDPOINT, insecure)
+        link = options.make_link(listen or options.DEFAULT_ENDPOINT, certs, insecure)
         if run is not None and config is None and (run / "config.toml").exists():
             config = run / "config.toml"
         resolved = options.configuration(preset, variant, config, settings, seed)
-        with open_hub(address) as session:
+        with open_hub(link) as session:
             name = run.resolve().name if run else "standalone"
-            _serve(CurriculumService(session, name, resolved, None, folder), address)
+            _serve(CurriculumService(session, name, resolved, None, folder, link.group), link)
 
 
-def _serve(service: CurriculumService, address: str) -> None:
-    log.info("curriculum answers at %s", address)
+def _serve(service: CurriculumService, link: Link) -> None:
+    log.info("curriculum answers at %s", link)
     try:
         service.run()
     finally:
@@ -89,12 +92,13 @@ def query(
     t: Annotated[int, typer.Option(min=0, help="The asking agent's environment steps so far.")] = 0,
     connect: options.Connect = options.DEFAULT_ENDPOINT,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait.")] = 10.0,
+    certs: options.Certs = None,
     as_json: options.Json = False,
     insecure: options.Insecure = False,
 ) -> None:
     """Ask a running curriculum for tasks."""
     check_cell(cell)
-    with open_client(check_endpoint(connect, insecure), patience=timeout) as session:
+    with open_client(options.make_link(connect, certs, insecure), patience=timeout) as session:
         question = TaskQuery(cell=cell, t=t, count=count)
         answer = ask(session, Keys("*").task, question, Proposals, timeout, patience=timeout)
     if as_json:

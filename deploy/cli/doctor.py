@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shutil
 import sys
 from importlib.metadata import version
@@ -12,29 +13,53 @@ from typing import Annotated, Any
 
 import typer
 
-from common.bus import NoAnswerError, RefusedError, check_endpoint, open_client
-from common.messages import SCHEMA_VERSION, MessageError
+from common.access import ROLES
+from common.bus import Keys, Link, Member, NoAnswerError, RefusedError, list_members, open_client
+from common.errors import RunError, UsageError
+from common.messages import PROTOCOL, MessageError
 from deploy.cli import options
 
 PACKAGES = ("navaclq", "eclipse-zenoh", "torch", "pybullet", "numpy", "onnxruntime", "gymnasium", "pydantic")
 
 
 def doctor(
-    connect: Annotated[str | None, typer.Option(help="Endpoint of the hub; exit 1 if silent.")] = None,
+    connect: Annotated[
+        str | None, typer.Option(envvar="NAVACLQ_CONNECT", help="Endpoint of the hub; exit 1 if silent.")
+    ] = None,
+    certs: options.Certs = None,
     insecure: options.Insecure = False,
+    only_hub: Annotated[
+        bool, typer.Option("--only-hub", help="Ask the hub and nothing else, for probes; exit 1 if silent.")
+    ] = False,
+    member: Annotated[
+        str | None,
+        typer.Option(metavar="ROLE[/NAME]", help="Exit 1 unless such a process is connected to the hub."),
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Check versions, cores, pybullet's numpy support, torch's threads, free disk, and a named hub."""
-    address = check_endpoint(connect or options.DEFAULT_ENDPOINT, insecure)
-    found = examine()
-    found["hub"] = _ask_hub(address)
+    link = options.make_link(connect or options.DEFAULT_ENDPOINT, certs, insecure)
+    wanted = _parse_member(member, link) if member is not None else None
+    found = {} if only_hub else examine()
+    found["hub"] = _ask_hub(link, wanted, patience=0.0 if only_hub else 1.0)
     if as_json:
         options.print_json(found)
     else:
         for key, value in found.items():
             sys.stdout.write(f"{key:18} {value}\n")
-    if connect and not found["hub"]["answers"]:
+    if not found["hub"]["answers"] and (connect or only_hub or wanted):
         raise typer.Exit(1)
+    if wanted and not found["hub"]["members"]:
+        raise RunError(f"no {member} is connected to the hub at {link}")
+
+
+def _parse_member(text: str, link: Link) -> Member:
+    """Whom ROLE[/NAME] covers, as far as these credentials may see."""
+    match = re.fullmatch(r"([A-Za-z0-9_.-]{1,64})(?:/([A-Za-z0-9_.-]{1,64}))?", text)
+    if not match:
+        raise UsageError(f"--member {text!r} must be ROLE or ROLE/NAME, for example actor/host-a-0")
+    group = "*" if link.credentials is None or link.group in ROLES else link.group
+    return Member(match[1], group, match[2] or "*")
 
 
 def examine() -> dict[str, Any]:
@@ -47,7 +72,7 @@ def examine() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
         "versions": {name: version(name) for name in PACKAGES},
-        "protocol": SCHEMA_VERSION,
+        "protocol": PROTOCOL,
         "cores": os.cpu_count(),
         "load_average": round(os.getloadavg()[0], 2),
         "pybullet_numpy": has_numpy(),
@@ -57,14 +82,19 @@ def examine() -> dict[str, Any]:
     }
 
 
-def _ask_hub(address: str) -> dict[str, Any]:
+def _ask_hub(link: Link, wanted: Member | None, patience: float) -> dict[str, Any]:
+    """Whether it is there, and who of the wanted; else the run, for which it waits up to `patience` s."""
     from common.contract import fetch_contract
 
-    answer: dict[str, Any] = {"endpoint": address, "answers": False}
+    answer: dict[str, Any] = {"endpoint": str(link), "answers": False}
     try:
-        with open_client(address, patience=1.0) as session:
+        with open_client(link, patience=1.0) as session:
             answer["answers"] = True
-            answer["run"] = fetch_contract(session, patience=1.0).run
-    except (NoAnswerError, RefusedError, MessageError) as error:
+            if wanted:
+                found = list_members(session, Keys("*"), wanted)
+                answer["members"] = sorted(str(member) for member in found)
+            else:
+                answer["run"] = fetch_contract(session, patience=patience).run
+    except (NoAnswerError, RefusedError, MessageError, UsageError) as error:
         answer["reason"] = str(error)
     return answer

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import sys
+import traceback
+from typing import NoReturn
 
 import typer
 from typer.exceptions import TyperException
 
-from common.bus import NoAnswerError, RefusedError
+from common.bus import NoAnswerError, RefusedError, end_process
 from common.errors import RunError, UsageError
 from common.messages import MessageError
-from deploy.cli import bench, config, curriculum, doctor, evaluate, pretrain, processes, train, world
+from deploy.cli import (
+    bench,
+    certs,
+    config,
+    curriculum,
+    doctor,
+    evaluate,
+    pretrain,
+    processes,
+    top,
+    train,
+    world,
+)
 
 app = typer.Typer(
     name="navaclq",
@@ -23,31 +37,43 @@ app.command("train")(train.train)
 app.command("pretrain")(pretrain.pretrain)
 app.command("learner")(processes.learner)
 app.command("actor")(processes.actor)
+app.command("router")(processes.router)
 app.command("evaluate")(evaluate.evaluate)
+app.command("top")(top.top)
 app.command("doctor")(doctor.doctor)
 app.add_typer(curriculum.app, name="curriculum")
 app.add_typer(world.app, name="world")
 app.add_typer(bench.app, name="bench")
 app.add_typer(config.app, name="config")
+app.add_typer(certs.app, name="certs")
 
 
-def run() -> None:
+def run() -> NoReturn:
     """Entry point: exit 0 on success, 2 on wrong use with one sentence, 1 on failure."""
+    end_process(_run())
+
+
+def _run() -> int:
     try:
         code = app(standalone_mode=False)
     except UsageError as error:
         sys.stderr.write(f"error: {error}\n")
-        sys.exit(2)
+        return 2
     except (NoAnswerError, RefusedError, MessageError, RunError) as error:
         sys.stderr.write(f"error: {error}\n")
-        sys.exit(1)
+        return 1
     except KeyboardInterrupt:
-        sys.exit(130)
+        return 130
+    except SystemExit as end:  # of a signal
+        return end.code if isinstance(end.code, int) else 0
     except TyperException as error:
         message = error.format_message()
         sys.stderr.write(f"error: {message or 'a command is missing; see navaclq --help'}\n")
-        sys.exit(2)
-    sys.exit(code if isinstance(code, int) else 0)
+        return 2
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return code if isinstance(code, int) else 0
 
 
 if __name__ == "__main__":

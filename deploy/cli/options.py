@@ -16,6 +16,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress, TextColumn
 
+from common import bus
+from common.access import load_credentials
+from common.bus import Link
 from common.cells import ROOM_NAMES, check_cell
 from common.config import Config, resolve
 from common.errors import UsageError
@@ -42,7 +45,18 @@ Source = Annotated[
 Seed = Annotated[
     int | None, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random (default 0).")
 ]
-Connect = Annotated[str, typer.Option(help="Endpoint of the hub, tcp/HOST:PORT.")]
+Connect = Annotated[
+    str,
+    typer.Option(
+        envvar="NAVACLQ_CONNECT",
+        help="Endpoint of the hub, tcp/HOST:PORT or tls/HOST:PORT; several in order, separated by commas.",
+    ),
+]
+Listen = Annotated[str, typer.Option(help="Endpoint to listen on, tcp/HOST:PORT or tls/HOST:PORT.")]
+Certs = Annotated[
+    Path | None,
+    typer.Option(envvar="NAVACLQ_CERTS", help="Folder of this process's certificate, for tls/HOST:PORT."),
+]
 Insecure = Annotated[
     bool, typer.Option("--insecure", help="Allow plain TCP beyond loopback: anybody on the way can read it.")
 ]
@@ -76,6 +90,11 @@ def configuration(
 ) -> Config:
     """The configuration that the common options ask for."""
     return resolve(preset, file, tuple(settings or ()), variant, seed)
+
+
+def make_link(text: str, certs: Path | None, insecure: bool) -> Link:
+    """The link that the options --connect or --listen, --certs and --insecure ask for."""
+    return bus.make_link(text, load_credentials(certs) if certs else None, insecure)
 
 
 def make_task(world: WorldConfig, room: str, seed: int, place: str | None, shift: str | None) -> Task:

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import check_endpoint
+from common.bus import Link
 from common.config import Config, Objective
 from common.telemetry import exit_on_signals
 from deploy.cli import options
@@ -76,11 +76,11 @@ def pretrain(
         result = _examine(encoder_folder(examined))
         result = {"encoder": examined, **result}
     else:
-        address = check_endpoint(listen or f"tcp/127.0.0.1:{free_port()}", insecure)
+        link = options.make_link(listen or f"tcp/127.0.0.1:{free_port()}", None, insecure)
         given = {"objective": objective, "sequences": sequences, "epochs": epochs}
         extra = [f"pretraining.{key}={value}" for key, value in given.items() if value is not None]
         directory = _open(run, preset, config, [*(settings or ()), *extra], seed)
-        result = _pretrain(directory, out, frames, actors, address)
+        result = _pretrain(directory, out, frames, actors, link)
     if as_json:
         options.print_json(result)
     else:
@@ -107,7 +107,7 @@ def _pretrain(
     out: Path | None,
     frames: Path | None,
     actors: int | None,
-    address: str,
+    link: Link,
 ) -> dict[str, Any]:
     from deploy.pretraining import check_out, export, gather
     from learner.pretraining.frame_store import FrameStore
@@ -120,8 +120,8 @@ def _pretrain(
     store = FrameStore(frames or folder / "frames", config)
     exit_on_signals()
     if not store.complete:
-        with options.progress(f"frames from hub {address}", own.sequences) as report:
-            gather(store, folder, name, count, address, report, _say)
+        with options.progress(f"frames from hub {link}", own.sequences) as report:
+            gather(store, folder, name, count, link, report, _say)
     table, held_out = store.load()
     trainer = Trainer(config, table, held_out, folder)
     _train(trainer, own.epochs, len(trainer.train_rows))

@@ -16,10 +16,10 @@ from typing import IO, Annotated
 
 import typer
 
-from common.bus import check_endpoint, open_client, open_hub
+from common.bus import Member, open_client, open_hub, open_router
 from common.errors import UsageError
 from common.files import lock
-from common.telemetry import exit_on_signals, start_logging
+from common.telemetry import exit_on_signals, start_logging, stop_on_signals
 from deploy.cli import options
 
 log = logging.getLogger("navaclq")
@@ -27,7 +27,8 @@ log = logging.getLogger("navaclq")
 
 def learner(
     run: options.Run,
-    listen: Annotated[str, typer.Option(help="Endpoint to listen on.")] = options.DEFAULT_ENDPOINT,
+    listen: options.Listen = options.DEFAULT_ENDPOINT,
+    certs: options.Certs = None,
     minutes: options.Minutes = None,
     preset: options.Preset = None,
     variant: options.Variant = None,
@@ -41,22 +42,23 @@ def learner(
     from learner.checkpoint import RunDirectory
     from learner.service import LearnerService
 
-    address = check_endpoint(listen, insecure)
+    link = options.make_link(listen, certs, insecure)
     wanted = None
     if not (run / "run.json").exists() or any((preset, variant, config, settings, seed is not None)):
         wanted = options.configuration(preset, variant, config, settings, seed)
     directory = RunDirectory(run, wanted, source=source)
     start_logging()
     exit_on_signals()
-    with open_hub(address) as session:
-        service = LearnerService(session, directory, minutes if minutes is not None else math.inf)
-        log.info("learner of run %r listens on %s", directory.name, address)
+    with open_hub(link) as session:
+        service = LearnerService(session, directory, minutes if minutes is not None else math.inf, link.group)
+        log.info("learner of run %r listens on %s", directory.name, link)
         service.run()
         service.close()  # not after an exception: the state is not to be trusted then
 
 
 def actor(
     connect: options.Connect = options.DEFAULT_ENDPOINT,
+    certs: options.Certs = None,
     count: Annotated[int, typer.Option(min=1, max=256, help="Actor processes to start on this host.")] = 1,
     cells: Annotated[str, typer.Option(help="Cells to drive in, for example 0,3-5.")] = "0-8",
     name: Annotated[
@@ -69,7 +71,7 @@ def actor(
     insecure: options.Insecure = False,
 ) -> None:
     """Run actors: simulation, policy, delivery. Everything else they need comes from the hub."""
-    address = check_endpoint(connect, insecure)
+    link = options.make_link(connect, certs, insecure)
     chosen = options.parse_cells(cells)
     if count > 1:
         _start_many(count, name)
@@ -80,19 +82,38 @@ def actor(
 
     start_logging()
     exit_on_signals()
-    with open_client(address, say_waiting(f"the hub at {address}")) as session:
+    with open_client(link, say_waiting(f"the hub at {link}")) as session:
         contract = fetch_contract(session, say_waiting("a learner at the hub"))
         resolved = accept_contract(contract, tuple(settings or ()))
-        spools = spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run
+        spools = (spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run) / link.group
         own, lock = claim_name(spools, name)
+        member = Member("actor", link.group, own)
         kind = ActorService if contract.job == "training" else FrameService
-        service = kind(session, contract, resolved, own, spools / own, chosen)
-        log.info("actor %s drives %d worlds for run %r", own, service.worlds, contract.run)
+        service = kind(session, contract, resolved, member, spools / own, chosen)
+        log.info("%s drives %d worlds for run %r", member, service.worlds, contract.run)
         try:
             service.run()
         finally:
             service.close()
             lock.close()
+
+
+def router(
+    listen: options.Listen,
+    connect: Annotated[
+        str | None, typer.Option(envvar="NAVACLQ_CONNECT", help="Endpoint of the hub to pass on to, if any.")
+    ] = None,
+    certs: options.Certs = None,
+    insecure: options.Insecure = False,
+) -> None:
+    """Join networks: pass messages on between the clients that connect here and the learner's hub."""
+    here = options.make_link(listen, certs, insecure)
+    hub = options.make_link(connect, certs, insecure) if connect else None
+    start_logging()
+    exit_on_signals()
+    with open_router(here, hub, say_waiting(f"the hub at {hub}")):
+        log.info("router listens on %s%s", here, f", connected to {hub}" if hub else "")
+        stop_on_signals().wait()
 
 
 def claim_name(spools: Path, wanted: str | None) -> tuple[str, IO[bytes]]:

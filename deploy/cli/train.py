@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 
-from common.bus import Keys, open_client
+from common.bus import Keys, make_link, open_client
 from common.config import Config, parse, resolve
 from common.contract import fetch_contract
 from common.errors import UsageError
+from common.members import Members
 from common.messages import ContractReply
 from common.resources import learner_threads
 from common.tasks import suite as suite_tasks
@@ -22,7 +24,8 @@ from common.telemetry import exit_on_signals
 from deploy.cli import options
 from deploy.cli.evaluate import run_tasks
 from deploy.launcher import Child, Supervisor, free_port
-from deploy.screen import Monitor, Screen
+from deploy.screen import Screen
+from deploy.troubles import number
 
 
 def train(
@@ -105,9 +108,14 @@ def _supervise(
             supervisor.add(
                 Child(f"local-{i}", lambda command=command: command, run / "logs" / f"local-{i}.log")  # type: ignore[misc]
             )
-        with open_client(address, lambda waited: supervisor.check()) as session:
-            monitor = Monitor(session, Keys(run.resolve().name))
-            screen = Screen(monitor, f"navaclq train {run}")
+        with open_client(make_link(address), lambda waited: supervisor.check()) as session:
+            monitor = Members(session, Keys(run.resolve().name))
+            screen = Screen(
+                monitor,
+                Console(stderr=True),
+                f"navaclq train {run}",
+                lambda: [(c.name, c.alive, c.restarts) for c in supervisor.children],
+            )
             for event in early:
                 screen.say(event)
             contract = fetch_contract(session, lambda waited: supervisor.check())
@@ -117,8 +125,8 @@ def _supervise(
             )
             while not main.finished:
                 supervisor.check()
-                clock.read(float(monitor.learner.get("elapsed_s", 0.0)))
-                screen.update(lambda: [(c.name, c.alive, c.restarts) for c in supervisor.children])
+                clock.read(number(monitor.learner, "elapsed_s"))
+                screen.update()
                 time.sleep(0.2)
         return os.getloadavg()[0]
     finally:

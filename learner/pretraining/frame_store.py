@@ -66,18 +66,19 @@ class FrameStore:
         """Whether there are as many sequences as configured."""
         return self.sequences >= self.config.pretraining.sequences
 
-    def add(self, origin: Origin, message: Frames, payload: bytes) -> bool:
-        """Writes a drive, on record when this returns; False when it was there before.
+    def seen(self, origin: Origin) -> bool:
+        """Whether a drive is here already."""
+        return self._log.seen.seen(origin)
+
+    def add(self, origin: Origin, message: Frames, payload: bytes) -> None:
+        """Writes a drive that was not seen before, on record when this returns.
 
         Raises MessageError when it does not fit, and OSError when it cannot be written.
         """
-        if self._log.seen.seen(origin):
-            return False
         most = self.config.pretraining.drive_steps + 1
         message.check_layout(self.config.world.camera.size, most)
         self._log.append(origin, len(message.frame), payload)
         self._count(len(message.frame))
-        return True
 
     def seal(self) -> None:
         """Closes the shards and writes the manifest."""

@@ -4,19 +4,10 @@ from __future__ import annotations
 
 import zenoh
 
-from common.bus import BUSY, Keys, QueryServer, serve
+from common.bus import BUSY, Keys, serve
 from common.contract import check_digest, digest
-from common.delivery import unpack_header
-from common.messages import (
-    Acknowledgement,
-    ContractReply,
-    Frames,
-    Message,
-    MessageError,
-    Nothing,
-    decode,
-    encode,
-)
+from common.delivery import Receiver
+from common.messages import ContractReply, Frames, Message, MessageError, Nothing, Origin, decode
 from learner.pretraining.frame_store import FrameStore
 
 
@@ -32,20 +23,18 @@ class FrameReceiver:
         )
         keys = Keys(name)
         self._servers = [
-            QueryServer(session, keys.frames, self._take),
+            Receiver(session, keys.frames, self._take, store.seen, Frames.max_bytes),
             serve(session, keys.contract, Nothing, self._answer_contract),
         ]
 
-    def _take(self, payload: bytes, attachment: bytes) -> bytes:
-        origin = unpack_header(attachment, payload)
+    def _take(self, origin: Origin, payload: bytes) -> None:
         message = decode(Frames, payload)
         check_digest(self.contract.digest, message.digest)
         try:
-            new = self._store.add(origin, message, payload)
+            self._store.add(origin, message, payload)
         except OSError as error:
             self.failure = error
             raise MessageError(BUSY) from None  # the sender keeps it, should there be a next time
-        return encode(Acknowledgement(duplicate=not new))
 
     def _answer_contract(self, question: Message) -> ContractReply:
         return self.contract
