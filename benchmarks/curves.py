@@ -25,7 +25,7 @@ Curve = dict[int, dict[str, Any]]
 
 def navaclq(*arguments: object) -> dict[str, Any]:
     """What a command prints as JSON; its progress is seen on stderr."""
-    command = [sys.executable, "-m", "deploy.cli.main", *map(str, arguments), "--json"]
+    command = [sys.executable, "-m", "deploy.cli", *map(str, arguments), "--json"]
     found: dict[str, Any] = json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
     return found
 

@@ -50,7 +50,7 @@ class Child:
         self.log_file.parent.mkdir(parents=True, exist_ok=True)
         with self.log_file.open("ab") as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "deploy.cli.main", *self.command()],
+                [sys.executable, "-m", "deploy.cli", *self.command()],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,

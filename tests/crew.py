@@ -42,7 +42,7 @@ class Processes:
         """`inside` is what to put before the command, to run it in another namespace."""
         with (self.folder / f"{name}.txt").open("ab") as output:
             self.running[name] = subprocess.Popen(
-                [*inside, sys.executable, "-m", "deploy.cli.main", *map(str, arguments)],
+                [*inside, sys.executable, "-m", "deploy.cli", *map(str, arguments)],
                 stdout=output,
                 stderr=output,
                 start_new_session=True,

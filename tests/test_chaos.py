@@ -192,6 +192,7 @@ def unleash(chaos: Chaos, seconds: float) -> None:
             while time.monotonic() < end:
                 time.sleep(chaos.dice.uniform(0.0, 2.0))
                 chaos.strike()
+            assert any(v["full"] for v in members.of("actor").values()), "no spool was ever full"
             before = delivered(members)
             wait_until(
                 lambda: all(now not in (0, before[n]) for n, now in delivered(members).items()),

@@ -106,7 +106,7 @@ def test_shown_configuration_reads_back(monkeypatch, capsys):
 
 def test_doctor_prints_one_json_object_last_on_stdout_even_with_pybullet_loaded():
     done = subprocess.run(
-        [sys.executable, "-m", "deploy.cli.main", "doctor", "--json"], capture_output=True, text=True
+        [sys.executable, "-m", "deploy.cli", "doctor", "--json"], capture_output=True, text=True
     )
     assert done.returncode == 0
     assert len(done.stdout.splitlines()) == 1

@@ -29,7 +29,7 @@ from learner.pretraining.receiver import FrameReceiver
 from tests.helpers import STORED, deliver, free_endpoint, reason, wait_until
 from tests.test_cli import call
 
-COMMAND = [sys.executable, "-m", "deploy.cli.main"]
+COMMAND = [sys.executable, "-m", "deploy.cli"]
 SMOKE = resolve("smoke")
 PROBED = {
     "visibility_accuracy",

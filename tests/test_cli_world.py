@@ -219,7 +219,7 @@ def test_record_films_a_drive_and_keeps_one_frame(monkeypatch, capsys, tmp_path)
 def run(*arguments) -> subprocess.CompletedProcess:
     """The command in a process of its own, as programs call it."""
     return subprocess.run(
-        [sys.executable, "-m", "deploy.cli.main", *map(str, arguments)], capture_output=True, text=True
+        [sys.executable, "-m", "deploy.cli", *map(str, arguments)], capture_output=True, text=True
     )
 
 

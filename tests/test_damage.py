@@ -183,7 +183,7 @@ def assert_one_sentence(words: str, *parts: str) -> None:
 )
 def test_run_directory_that_cannot_be_written_is_named_in_one_sentence(disk, reason, existing):
     run = disk.folder / "run"
-    command = [*disk.inside, sys.executable, "-m", "deploy.cli.main", "learner", "--run", str(run)]
+    command = [*disk.inside, sys.executable, "-m", "deploy.cli", "learner", "--run", str(run)]
     if existing:
         RunDirectory(disk.outside / "run", resolve("smoke"))
     else:

@@ -153,7 +153,7 @@ def test_smoke_and_end_to_end_begin_with_random_weights():
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_figures_of_a_shipped_encoder_are_found_again(name):
     done = subprocess.run(
-        [sys.executable, "-m", "deploy.cli.main", "pretrain", "--evaluate", name, "--json"],
+        [sys.executable, "-m", "deploy.cli", "pretrain", "--evaluate", name, "--json"],
         capture_output=True,
         text=True,
         check=True,

@@ -139,7 +139,7 @@ def secure(network: Network, tmp_path: Path) -> Iterator[Hosts]:
     certs = tmp_path / "certs"
     groups = [word for group in GROUPS.values() for word in ("--group", group)]
     command = ("certs", "init", certs, "--host", network.hosts[0].address, *groups)
-    subprocess.run([sys.executable, "-m", "deploy.cli.main", *map(str, command)], check=True)
+    subprocess.run([sys.executable, "-m", "deploy.cli", *map(str, command)], check=True)
     found = Hosts(tmp_path, network, certs)
     yield found
     found.close()

@@ -69,7 +69,7 @@ def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
     output = folder / "output.txt"
     with output.open("wb") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "deploy.cli.main", *(part.format(**words) for part in COMMANDS[name])],
+            [sys.executable, "-m", "deploy.cli", *(part.format(**words) for part in COMMANDS[name])],
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=file,

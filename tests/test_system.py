@@ -106,7 +106,7 @@ def test_four_processes_started_by_hand_train_and_survive_the_loss_of_one(proces
 @pytest.mark.timeout(240)
 def test_train_sums_up_as_json_resumes_and_restarts_what_dies(tmp_path):
     run = tmp_path / "trained"
-    command = [sys.executable, "-m", "deploy.cli.main", "train", "--run", str(run), "--json"]
+    command = [sys.executable, "-m", "deploy.cli", "train", "--run", str(run), "--json"]
     first = subprocess.run(
         [*command, "--minutes", "0.2", "--seed", "3", *SMOKE], capture_output=True, text=True, timeout=100
     )
@@ -152,7 +152,7 @@ def test_train_sums_up_as_json_resumes_and_restarts_what_dies(tmp_path):
 def test_interrupted_train_stops_all_its_processes(tmp_path):
     run = tmp_path / "interrupted"
     train = subprocess.Popen(
-        [sys.executable, "-m", "deploy.cli.main", "train", "--run", str(run), "--minutes", "5", *SMOKE],
+        [sys.executable, "-m", "deploy.cli", "train", "--run", str(run), "--minutes", "5", *SMOKE],
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -175,7 +175,7 @@ def test_interrupted_train_stops_all_its_processes(tmp_path):
 def test_curriculum_alone_answers_queries_as_documented(processes, tmp_path):
     endpoint = free_endpoint()
     processes.start("alone", "curriculum", "serve", "--listen", endpoint)
-    query = [sys.executable, "-m", "deploy.cli.main", "curriculum", "query", "--connect", endpoint]
+    query = [sys.executable, "-m", "deploy.cli", "curriculum", "query", "--connect", endpoint]
     done = subprocess.run(
         [*query, "--cell", "3", "--count", "5", "--json", "--timeout", "30"], capture_output=True, text=True
     )
@@ -201,7 +201,7 @@ def test_curriculum_alone_answers_queries_as_documented(processes, tmp_path):
 )
 def test_preset_and_variants_train_for_two_minutes_with_finite_losses(tmp_path, arguments):
     # the paper's warm-up of 15,000 steps outlasts two minutes, so it is shortened here, for all alike
-    command = [sys.executable, "-m", "deploy.cli.main", "train", "--run", str(tmp_path / "run"), "--json"]
+    command = [sys.executable, "-m", "deploy.cli", "train", "--run", str(tmp_path / "run"), "--json"]
     done = subprocess.run(
         [*command, "--minutes", "2", "--set", "replay.warmup_steps=1000", *arguments],
         capture_output=True,

@@ -22,7 +22,7 @@ from common.messages import PROTOCOL, Stat
 from common.telemetry import Reporter
 from common.version import code_version
 from deploy import certs, screen
-from deploy.cli import doctor, options, top
+from deploy.cli import doctor, main, options, top
 from deploy.launcher import free_port
 from deploy.screen import Census, Screen, line, picture
 from deploy.troubles import Process, find_troubles, number, plain, span
@@ -72,6 +72,12 @@ ACTOR = {
     **{f"{name}_p{p}_ms": p / 4 for name in screen.CHANNELS for p in (50, 99)},
 }
 GONE = {"alive": False}
+
+
+@pytest.fixture(autouse=True)
+def this_process_goes_on(monkeypatch):
+    monkeypatch.setattr(main, "end_process", sys.exit)
+    monkeypatch.setattr(top, "exit_on_signals", lambda: None)
 
 
 def process(
@@ -445,11 +451,6 @@ def people(hub, client):
         token.undeclare()
 
 
-@pytest.fixture
-def keep_signals(monkeypatch):
-    monkeypatch.setattr(top, "exit_on_signals", lambda: None)
-
-
 class Talkers:
     """Reports of several processes, again and again while it is entered."""
 
@@ -470,7 +471,6 @@ class Talkers:
         self._thread.join()
 
 
-@pytest.mark.usefixtures("keep_signals")
 def test_json_describes_every_process_and_ends(monkeypatch, capsys, people, endpoint):
     talk = Talkers(
         (people("learner", "learner"), LEARNER),
@@ -501,7 +501,6 @@ def test_json_describes_every_process_and_ends(monkeypatch, capsys, people, endp
     assert "actor a's spool is full: the simulation is paused" in found["troubles"]
 
 
-@pytest.mark.usefixtures("keep_signals")
 def test_without_a_terminal_one_picture_is_printed_when_all_have_spoken(
     monkeypatch, capsys, people, endpoint
 ):
@@ -516,7 +515,6 @@ def test_without_a_terminal_one_picture_is_printed_when_all_have_spoken(
     assert re.search(r"actor a +alive", out)
 
 
-@pytest.mark.usefixtures("keep_signals")
 def test_without_a_hub_it_says_so(monkeypatch, capsys, endpoint):
     monkeypatch.setattr(top, "PATIENCE", 0.1)
     code, out, err = call(monkeypatch, capsys, "top", "--once", "--connect", endpoint)
@@ -598,9 +596,8 @@ def test_a_probe_of_a_silent_hub_fails(monkeypatch, capsys, endpoint):
 def test_a_probe_does_not_load_what_computes(people, endpoint):
     people("actor", "a-0")
     code = (
-        "import sys; from deploy.cli.main import run\n"
-        "try: run()\n"
-        "except SystemExit as end: assert end.code == 0, end.code\n"
+        "import sys; from deploy.cli.main import app\n"
+        "assert not app(standalone_mode=False)\n"
         "assert not {'torch', 'pybullet', 'onnxruntime', 'PIL'} & set(sys.modules), 'slow'"
     )
     for more in ([], ["--member", "actor/a-0"]):
@@ -633,7 +630,6 @@ def test_processes_see_with_their_certificates_what_their_probes_ask(monkeypatch
             assert probe(name, "actor") == 0
             assert probe(name, "actor/b-1") == 1
         assert probe("operator", "learner") == 0
-        monkeypatch.setattr(top, "exit_on_signals", lambda: None)
         monkeypatch.setattr(top, "PATIENCE", 1.0)
         arguments = ("top", "--json", "--connect", endpoint, "--certs", tmp_path / "ca" / "operator")
         code, out, _ = call(monkeypatch, capsys, *arguments)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-import traceback
 from typing import NoReturn
 
 import typer
 from typer.exceptions import TyperException
 
-from common.bus import NoAnswerError, RefusedError, end_process
+from common.bus import NoAnswerError, RefusedError
 from common.errors import RunError, UsageError
 from common.messages import MessageError
 from deploy.cli import (
@@ -49,32 +49,20 @@ app.add_typer(certs.app, name="certs")
 
 
 def run() -> NoReturn:
-    """Entry point: exit 0 on success, 2 on wrong use with one sentence, 1 on failure."""
-    end_process(_run())
-
-
-def _run() -> int:
+    """Runs a command and exits: 0 on success, 2 on wrong use with one sentence, 1 on failure."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code = app(standalone_mode=False)
     except UsageError as error:
         sys.stderr.write(f"error: {error}\n")
-        return 2
+        sys.exit(2)
     except (NoAnswerError, RefusedError, MessageError, RunError) as error:
         sys.stderr.write(f"error: {error}\n")
-        return 1
+        sys.exit(1)
     except KeyboardInterrupt:
-        return 130
-    except SystemExit as end:  # of a signal
-        return end.code if isinstance(end.code, int) else 0
+        sys.exit(130)
     except TyperException as error:
         message = error.format_message()
         sys.stderr.write(f"error: {message or 'a command is missing; see navaclq --help'}\n")
-        return 2
-    except Exception:
-        traceback.print_exc()
-        return 1
-    return code if isinstance(code, int) else 0
-
-
-if __name__ == "__main__":
-    run()
+        sys.exit(2)
+    sys.exit(code if isinstance(code, int) else 0)

@@ -148,7 +148,7 @@ def say_waiting(whom: str) -> Callable[[float], None]:
 def _start_many(count: int, base: str | None) -> None:
     """Runs `count` actors as processes of their own and passes a signal on to them."""
     arguments = _without(sys.argv[1:], "--count", "--name")
-    command = [sys.executable, "-m", "deploy.cli.main", *arguments]
+    command = [sys.executable, "-m", "deploy.cli", *arguments]
     exit_on_signals()
     children: list[subprocess.Popen[bytes]] = []
     try:
