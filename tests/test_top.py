@@ -22,7 +22,7 @@ from common.messages import PROTOCOL, Stat
 from common.telemetry import Reporter
 from common.version import code_version
 from deploy import certs, screen
-from deploy.cli import doctor, main, options, top
+from deploy.cli import doctor, options, top
 from deploy.launcher import free_port
 from deploy.screen import Census, Screen, line, picture
 from deploy.troubles import Process, find_troubles, number, plain, span
@@ -75,8 +75,7 @@ GONE = {"alive": False}
 
 
 @pytest.fixture(autouse=True)
-def this_process_goes_on(monkeypatch):
-    monkeypatch.setattr(main, "end_process", sys.exit)
+def signals_stay_as_they_are(monkeypatch):
     monkeypatch.setattr(top, "exit_on_signals", lambda: None)
 
 
