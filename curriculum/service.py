@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -32,6 +33,7 @@ from common.telemetry import Reporter, stop_on_signals
 from common.weights import WeightsPuller
 from curriculum.curriculum import Curriculum
 
+log = logging.getLogger(__name__)
 Report = TypeVar("Report", Outcome, Candidates)
 SAVE_SECONDS = 5.0
 CRITIC_REST_SECONDS = 6.0
@@ -55,7 +57,7 @@ class CurriculumService:
         self._folder = folder
         if folder is not None:
             self.curriculum.restore(folder)
-        self._digest = digest
+        self._digest, self._failed_writes = digest, 0
         self._lock = threading.Lock()
         keys = Keys(run)
         member = Member("curriculum", group, "curriculum")
@@ -90,10 +92,15 @@ class CurriculumService:
                 self.save()
 
     def save(self) -> None:
-        """Writes the state to the folder, if there is one."""
-        if self._folder is not None:
+        """Writes the state to the folder, if there is one; a full disk must not end the service."""
+        if self._folder is None:
+            return
+        try:
             with self._lock:
                 self.curriculum.save(self._folder)
+        except OSError as error:
+            self._failed_writes += 1
+            log.error("cannot write to %s: %s; it is tried again", self._folder, error.strerror or error)
 
     def close(self) -> None:
         """Stops serving and saves."""
@@ -128,6 +135,7 @@ class CurriculumService:
             "fits": state.network.fits,
             "weights": f"{version.epoch}.{version.counter}",
             "inbox": sum(map(len, self._servers)),
+            "failed_writes": self._failed_writes,
             "refused": sum(sum(server.refused.values()) for server in self._servers),
             **{f"proposed_{name}": count for name, count in dict(state.proposed).items()},
         }

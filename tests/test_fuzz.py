@@ -313,7 +313,7 @@ def test_a_right_message_is_taken_after_the_wrong_ones(client, target):
         if channel.told:
             client.put(channel.key, payload)
             continue
-        header = msgpack.packb([[ADDRESS, "good", 0, len(payload), zlib.crc32(payload)]])
+        header = msgpack.packb([[ADDRESS, name, 0, len(payload), zlib.crc32(payload)]])
         ask_later(client, channel.key, payload, partial(answers.put), 60.0, header)
         answer = answers.get(timeout=60)
         assert isinstance(answer, bytes), (name, answer)
