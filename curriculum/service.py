@@ -57,7 +57,8 @@ class CurriculumService:
         self._folder = folder
         if folder is not None:
             self.curriculum.restore(folder)
-        self._digest, self._failed_writes = digest, 0
+        self._digest = digest
+        self._failed_writes, self._failed_at = 0, 0.0
         self._lock = threading.Lock()
         keys = Keys(run)
         member = Member("curriculum", group, "curriculum")
@@ -99,7 +100,7 @@ class CurriculumService:
             with self._lock:
                 self.curriculum.save(self._folder)
         except OSError as error:
-            self._failed_writes += 1
+            self._failed_writes, self._failed_at = self._failed_writes + 1, time.monotonic()
             log.error("cannot write to %s: %s; it is tried again", self._folder, error.strerror or error)
 
     def close(self) -> None:
@@ -139,6 +140,8 @@ class CurriculumService:
             "refused": sum(sum(server.refused.values()) for server in self._servers),
             **{f"proposed_{name}": count for name, count in dict(state.proposed).items()},
         }
+        if self._failed_writes:
+            values["failed_s"] = round(time.monotonic() - self._failed_at, 1)
         if math.isfinite(state.network.loss):
             values["loss"] = round(state.network.loss, 4)
         self._reporter.report(values)

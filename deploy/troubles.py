@@ -129,7 +129,7 @@ def find_troubles(processes: Iterable[Process]) -> list[str]:
     actors = [p for p in alive if p.role == "actor"]
     return [
         *_absences(known, alive, actors),
-        *_failed_writes(learner),
+        *_failed_writes(alive),
         *_silences(known, alive),
         *_refusals(actors),
         *_deliveries(actors, known),
@@ -159,13 +159,14 @@ def _since(gone: Process | None) -> str:
     return f" since {span(gone.silent)}" if gone else ""
 
 
-def _failed_writes(learner: Process | None) -> list[str]:
-    if learner is None or not learner.alive:
-        return []
-    count, ago = number(learner.values, "failed_writes"), number(learner.values, "failed_s")
-    if count < 1 or ago >= FAILED:
-        return []
-    return [f"learner: cannot write to its disk ({count:.0f} failed write{'s' if count > 1 else ''})"]
+def _failed_writes(alive: list[Process]) -> list[str]:
+    found = []
+    for process in alive:
+        count, ago = number(process.values, "failed_writes"), number(process.values, "failed_s")
+        if count >= 1 and ago < FAILED:
+            writes = f"{count:.0f} failed write{'s' if count > 1 else ''}"
+            found.append(f"{process.member}: cannot write to its disk ({writes})")
+    return found
 
 
 def _silences(known: list[Process], alive: list[Process]) -> list[str]:

@@ -303,7 +303,7 @@ def keys() -> Keys:
 
 @pytest.fixture
 def serve() -> Iterator[Callable[[zenoh.Session, str, bytes], None]]:
-    """Answers questions on a key with a text, until the test ends: later ones ask for contracts of any run."""
+    """Answers questions on a key with a text until the test ends: the next asks for contracts of any run."""
     with ExitStack() as stack:
 
         def answer(session: zenoh.Session, key: str, text: bytes) -> None:
@@ -824,17 +824,10 @@ def test_nothing_is_explained_when_something_else_answers(made):
 def test_the_command_line_says_in_one_sentence_why_a_hub_refuses(root):
     ours = root / "foreign" / "actor-a"
     with hub_with(root / "ca" / "learner") as endpoint:
-        command = [
-            sys.executable,
-            "-m",
-            "deploy.cli.main",
-            "actor",
-            "--connect",
-            endpoint,
-            "--certs",
-            str(ours),
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=150)
+        command = ["actor", "--connect", endpoint, "--certs", str(ours)]
+        done = subprocess.run(
+            [sys.executable, "-m", "deploy.cli", *command], capture_output=True, text=True, timeout=150
+        )
     said = f"the certificate of the hub at {endpoint} is not of the authority in {ours}/ca.pem"
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.splitlines()[-1] == f"error: {said}"
