@@ -37,7 +37,11 @@ def kill_the_learner_and_look(crew: Crew, moment: float) -> None:
     wait_until(
         lambda: (
             set(crew.of_actors("weights"))
-            <= {v.counter for v in list(crew.versions) if v.epoch > epoch and v.counter >= updates}
+            <= {
+                f"{v.epoch}.{v.counter}"
+                for v in list(crew.versions)
+                if v.epoch > epoch and v.counter >= updates
+            }
         ),
         20,
         "the new weights at both actors",
