@@ -178,7 +178,7 @@ def partition(hosts: Hosts, name: str, seconds: float) -> set[Id]:
     wait_until(lambda: hosts.sent(other) > sent, 20, f"episodes of {other}")
     wait_until(lambda: hosts.figure("updates") > updates, 20, "updates without the one that is cut off")
     wait_until(lambda: len(hosts.waiting_of(name)) > waited + 2, 20, f"episodes that wait at {name}")
-    held, newest = hosts.waiting_of(name), hosts.figure("updates")
+    held, newest = hosts.waiting_of(name), max(hosts.figure("updates"), hosts.weights(name) + 1)
     hosts.host[name].mend()
     mended = time.monotonic()
     wait_until(lambda: hosts.here(name) and hosts.weights(name) >= newest, BACK, f"{name} with new weights")
