@@ -57,7 +57,7 @@ def load_credentials(folder: Path) -> Credentials:
     try:
         content = {name: (folder / name).read_bytes() for name in ("ca.pem", "cert.pem", "key.pem")}
         listed = folder / "groups.txt"
-        groups = listed.read_text("utf-8").split() if listed.exists() else []
+        content["groups.txt"] = listed.read_bytes() if listed.exists() else b""
     except OSError as error:
         raise UsageError(
             f"--certs {folder}: cannot read {error.filename} ({error.strerror}); {made}"
@@ -66,6 +66,7 @@ def load_credentials(folder: Path) -> Credentials:
         authority = x509.load_pem_x509_certificate(content["ca.pem"])
         certificate = x509.load_pem_x509_certificate(content["cert.pem"])
         key = load_pem_private_key(content["key.pem"], None)
+        groups = content["groups.txt"].decode().split()
         name = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
     except (ValueError, TypeError, IndexError) as error:
         raise UsageError(f"--certs {folder}: not a PEM certificate and key ({error}); {made}") from None
@@ -81,6 +82,8 @@ def load_credentials(folder: Path) -> Credentials:
     for subject in (name, *groups):
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", subject):
             raise UsageError(f"--certs {folder}: {subject!r} is no role and no group of actors; {made}")
+    if roles := ROLES.keys() & set(groups):
+        raise UsageError(f"{listed} names {min(roles)}, a role, among the groups of actors")
     return Credentials(folder, name, tuple(groups))
 
 
@@ -222,7 +225,10 @@ def _rules(subject: str, rights: Rights) -> list[dict[str, Any]]:
         "serves": [(("declare_queryable", "reply"), into), (("query",), out)],
         "tells": [(("put",), into), (("declare_subscriber",), out)],
         "hears": [(("declare_subscriber",), into), (("put",), out)],
-        "lives": [(("liveliness_token",), into)],
+        "lives": [
+            (("liveliness_token",), into),
+            (("declare_liveliness_subscriber", "liveliness_query"), out),
+        ],
         "watches": [
             (("declare_liveliness_subscriber", "liveliness_query"), into),
             (("liveliness_token",), out),

@@ -112,10 +112,11 @@ def _compare(
     report: Report, config: Config, rounds: int, folder: Path, progress: Callable[[int, str], None]
 ) -> None:
     (folder / CONFIG).write_text(config.to_toml(), "utf-8")
-    endpoint, ours = f"tcp/127.0.0.1:{free_port()}", digest(config, b"")
-    episodes = {name: _episode(config, size, ours) for name, size in SIZES.items()}
-    small = encode(_episode(config, SMALL, ours))
+    endpoint, agreed = f"tcp/127.0.0.1:{free_port()}", digest(config, b"")
+    episodes = {name: _episode(config, size, agreed) for name, size in SIZES.items()}
+    small = encode(_episode(config, SMALL, agreed))
     times: dict[tuple[str, str], list[float]] = {}
+    used: dict[tuple[str, str], list[float]] = {}
     with ExitStack() as stack:
         receiver = stack.enter_context(_peer(folder, "receive", endpoint))
         port = receiver.hear()["zmq"]
@@ -134,32 +135,38 @@ def _compare(
         except ImportError as error:
             report.skipped.append(f"zmq: {error}; pip install 'navaclq[bench]'")
         for i in range(rounds + 1):  # the first warms up
-            measured: dict[tuple[str, str], float] = {}
+            measured: dict[tuple[str, str], tuple[float, float]] = {}
             for size, episode in episodes.items():
                 payload = encode(episode)
                 n = max(LEAST, VOLUME // len(payload))
                 for name, send in sends.items():
-                    measured[name, size] = ways.time(partial(send, episode, payload, n)) / n
+                    taken, cpu = ways.time(partial(send, episode, payload, n))
+                    measured[name, size] = taken / n, cpu / n
             for name, drain in (("bundled", _bundled), ("single", _single)):
                 boot = f"{name}-{i}"
                 spool = _filled(folder / boot, boot, small)
-                measured[name, "4k"] = _time(partial(drain, session, spool, boot)) / SMALL_COUNT
+                taken, cpu = ways.time(partial(drain, session, spool, boot))
+                measured[name, "4k"] = taken / SMALL_COUNT, cpu / SMALL_COUNT
             if i:
-                for key, seconds in measured.items():
+                for key, (seconds, cpu_seconds) in measured.items():
                     times.setdefault(key, []).append(seconds)
+                    used.setdefault(key, []).append(cpu_seconds)
                 progress(i, "")
         ways.close()
     if ways.lost:
         report.skipped.append(f"{ways.lost} measurements that lost the connection, and were repeated")
     lengths = {size: len(encode(episode)) for size, episode in episodes.items()} | {"4k": len(small)}
-    for (name, size), taken in times.items():
-        rate = 1 / median(taken)
+    for (name, size), seconds_each in times.items():
+        rate = 1 / median(seconds_each)
         report.add(f"{name}_{size}", rate, "episodes/s")
         report.add(f"{name}_{size}_volume", rate * lengths[size] / 1e6, "MB/s")
+        report.add(f"{name}_{size}_cpu", 1e3 * median(used[name, size]), "ms")
     for size in SIZES:
-        limit, acked = times["bare_query", size], times["acked_process", size]
-        report.compare(f"acked_process_over_bare_query_{size}", limit, acked)
-        report.compare(f"acked_host_over_bare_query_{size}", limit, times["acked_host", size])
+        for durability in DURABILITIES:
+            ours, limit = (f"acked_{durability}", size), ("bare_query", size)
+            report.compare(f"acked_{durability}_over_bare_query_{size}", times[limit], times[ours])
+            report.compare(f"acked_{durability}_over_bare_query_{size}_cpu", used[limit], used[ours])
+        acked = times["acked_process", size]
         report.compare(f"acked_over_put_{size}", times["put", size], acked)
         if "zmq" in sends:
             report.compare(f"acked_over_zmq_{size}", times["zmq", size], acked)
@@ -189,18 +196,28 @@ class _Ways:
         deadline = time.monotonic() + PATIENCE
         while True:
             try:
-                self._puts = int(ask_bytes(self._session, channel("count"), b""))
+                self._puts, _ = self._ask()
                 return
             except NoAnswerError:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(0.02)
 
-    def time(self, work: Callable[[], None]) -> float:
-        """Seconds that it takes; again when the connection is lost, as on a host that starves both ends."""
+    def _ask(self) -> tuple[int, float]:
+        """Puts that have come, and seconds of CPU that the receiver has used."""
+        puts, cpu = json.loads(ask_bytes(self._session, channel("count"), b""))
+        return puts, cpu
+
+    def time(self, work: Callable[[], None]) -> tuple[float, float]:
+        """Seconds that it takes, and seconds of CPU that both ends use for it.
+
+        Again when the connection is lost, as on a host that starves them.
+        """
         while True:
             try:
-                return _time(work)
+                before = self._ask()[1] + time.process_time()
+                taken = _time(work)
+                return taken, self._ask()[1] + time.process_time() - before
             except NoAnswerError:
                 self.lost += 1
                 if self.lost > MOST_LOST:
@@ -241,7 +258,7 @@ class _Ways:
             self._session.put(channel("put"), payload, congestion_control=zenoh.CongestionControl.BLOCK)
         self._puts += n
         deadline = time.monotonic() + PATIENCE
-        while int(ask_bytes(self._session, channel("count"), b"")) != self._puts:
+        while self._ask()[0] != self._puts:
             if time.monotonic() > deadline:
                 raise NoAnswerError("puts were lost")
 

@@ -79,7 +79,7 @@ def receive(folder: Path, endpoint: str) -> None:
 
 
 def _bare(session: zenoh.Session) -> list[Any]:
-    """Answers queries with nothing, at once; counts puts, and tells how many when it is asked."""
+    """Answers queries with nothing, at once; counts puts, and tells how many when asked, and the CPU time."""
     count = 0
 
     def answer(query: zenoh.Query) -> None:
@@ -92,7 +92,7 @@ def _bare(session: zenoh.Session) -> list[Any]:
 
     def tell(query: zenoh.Query) -> None:
         with query:
-            query.reply(channel("count"), str(count).encode())
+            query.reply(channel("count"), json.dumps([count, time.process_time()]).encode())
 
     return [
         session.declare_queryable(channel("query"), answer),

@@ -83,7 +83,8 @@ def actor(
     start_logging()
     exit_on_signals()
     with open_client(link, say_waiting(f"the hub at {link}")) as session:
-        contract = fetch_contract(session, say_waiting("a learner at the hub"))
+        leave = f", or to be admitted as {link.group}" if link.credentials else ""
+        contract = fetch_contract(session, say_waiting(f"a learner at the hub{leave}"))
         resolved = accept_contract(contract, tuple(settings or ()))
         spools = (spool or Path.home() / ".cache" / "navaclq" / "spool" / contract.run) / link.group
         own, lock = claim_name(spools, name)
