@@ -184,7 +184,7 @@ def _session_config(mode: str, listen: Link | None, connect: Link | None) -> zen
 
 def open_hub(link: Link) -> AbstractContextManager[zenoh.Session]:
     """A session that listens; raises UsageError when the address cannot be had."""
-    return _open("peer", link, None)
+    return _open("router", link, None)  # a peer would not tell clients of two routers of each other
 
 
 def open_client(
@@ -488,9 +488,20 @@ def publish(session: zenoh.Session, key: str, message: Message) -> None:
 
 
 class Subscription:
-    """Calls `handler`, which must not block, for well-formed messages; counts the others in `ignored`."""
+    """Calls `handler`, which must not block, for well-formed messages; counts the others in `ignored`.
 
-    def __init__(self, session: zenoh.Session, key: str, kind: type[M], handler: Callable[[M], None]) -> None:
+    With `signed`, a message counts only on a key that ends with what this makes of it: who may publish on
+    that key has no other voice.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        kind: type[M],
+        handler: Callable[[M], None],
+        signed: Callable[[M], str] | None = None,
+    ) -> None:
         self.ignored = 0
         self._logged = 0.0
 
@@ -498,7 +509,10 @@ class Subscription:
             try:
                 if len(sample.payload) > kind.max_bytes:
                     raise MessageError(f"too large: {len(sample.payload)} bytes")
-                handler(decode(kind, sample.payload.to_bytes()))
+                message = decode(kind, sample.payload.to_bytes())
+                if signed and not str(sample.key_expr).endswith(f"/{signed(message)}"):
+                    raise MessageError(f"under another's name: {signed(message)}")
+                handler(message)
             except MessageError as error:
                 self._ignore(str(sample.key_expr), error)
 

@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 DAMAGED = "payload damaged: its checksum does not match"
 LATER = (BUSY, INTERNAL_ERROR, DAMAGED)
 """Answers that mean: again, later. Any other refusal of a message is final."""
+HEADER_BYTES = 300
+"""More than the header of one message has."""
 BUNDLE_BYTES = 256 * 1024
 """Small messages that wait go together until they are as large as this."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 2.0
@@ -60,6 +62,8 @@ def pack_bundle(parcels: list[Parcel]) -> tuple[bytes, bytes]:
 def unpack_bundle(payload: bytes, attachment: bytes) -> list[Parcel]:
     """The messages of a delivery, checksums not yet compared; MessageError if malformed."""
     try:
+        if len(attachment) > BUNDLE * HEADER_BYTES:
+            raise ValueError
         headers = msgpack.unpackb(attachment)
         parcels, start = [], 0
         for actor, boot, seq, size, crc in headers:
@@ -309,7 +313,7 @@ class Sender:
                 log.warning("refused for good, %s of %s: %s", parcel.origin.seq, parcel.origin.boot, reason)
             else:
                 self.sent += 1
-        self.held_back, self.trouble = later == BUSY, later
+        self.trouble, self.held_back = later, later == BUSY
         if later:
             self._back_off()
         else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Callable
 
 import zenoh
@@ -14,7 +13,7 @@ from common.version import code_version
 
 Value = float | int | str
 MOST = 4096
-"""Processes of which figures are kept; more than a hub serves."""
+"""Processes of which figures are kept, the gone ones making room for those that are alive."""
 
 
 class Members:
@@ -29,17 +28,19 @@ class Members:
         self.stats: dict[Member, Stat] = {}
         self.heard: dict[Member, float] = {}
         """When the newest figures came, by time.monotonic()."""
-        self._lives: dict[Member, set[str]] = defaultdict(set)
+        self._lives: dict[Member, set[str]] = {}
         self._say, self._joined = say, set[Member]()
         self._subscriptions = (
-            Subscription(session, keys.stat(EVERYBODY), Stat, self._hear),
+            Subscription(
+                session, keys.stat(EVERYBODY), Stat, self._hear, lambda s: f"{s.role}/{s.group}/{s.name}"
+            ),
             watch_members(session, keys, self._watch),
         )
 
     @property
     def alive(self) -> set[Member]:
         """Those that are connected; of a process that froze or lost its link it is known after the lease."""
-        return {member for member, lives in list(self._lives.items()) if lives}
+        return set(self._lives)
 
     def of(self, role: str) -> dict[str, dict[str, Value]]:
         """Newest figures of the processes of a role, by label."""
@@ -58,9 +59,12 @@ class Members:
     def _hear(self, stat: Stat) -> None:
         member = Member(stat.role, stat.group, stat.name)
         if member not in self.stats and len(self.stats) >= MOST:
-            return
+            gone = next((known for known in self.stats if known not in self._lives), None)
+            if gone is None or member not in self._lives:
+                return
+            del self.stats[gone], self.heard[gone]
         self.stats[member], self.heard[member] = stat, time.monotonic()
-        if self._lives[member] and member not in self._joined:
+        if member in self._lives and member not in self._joined:
             self._joined.add(member)
             other = (
                 "" if stat.code == code_version() else f", code {stat.code}, which is not that of this host"
@@ -68,8 +72,13 @@ class Members:
             self._say(f"{member} joined from {stat.host} (process {stat.pid}{other})")
 
     def _watch(self, member: Member, life: str, alive: bool) -> None:
-        lives = self._lives[member]
-        lives.add(life) if alive else lives.discard(life)
+        if alive:
+            self._lives.setdefault(member, set()).add(life)
+            return
+        lives = self._lives.get(member, set())
+        lives.discard(life)
+        if not lives:
+            self._lives.pop(member, None)
         if not lives and member in self._joined:
             self._joined.discard(member)
             self._say(f"{member} left")

@@ -275,6 +275,8 @@ class ContractReply(Message):
 class Stat(Message):
     """A process's figures for the live screen, about once a second."""
 
+    max_bytes: ClassVar[int] = 16 * 1024
+
     role: Name
     group: Name
     name: Name

@@ -1,7 +1,9 @@
 import json
+import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,9 +18,6 @@ from common.bus import (
     RefusedError,
     ask,
     ask_bytes,
-    make_link,
-    open_client,
-    open_hub,
     publish,
 )
 from common.config import Config
@@ -262,28 +261,40 @@ def test_second_curriculum_of_a_run_is_refused(started):
         started()
 
 
-@contextmanager
-def running(endpoint: str) -> Iterator[CurriculumService]:
-    """A service that runs until its session is closed."""
-    with open_hub(make_link(endpoint)) as hub:
-        service = CurriculumService(hub, "run-1", OPEN, DIGEST, None)
+def run_during(service: CurriculumService, action: Callable[[], None]) -> None:
+    """Runs a service, here as signals want it, while a thread does the action and then ends it by SIGTERM."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    ended, failures = threading.Event(), list[BaseException]()
 
-        def run() -> None:
-            with suppress(zenoh.ZError):
-                service.run()
+    def act() -> None:
+        try:
+            action()
+        except BaseException as failure:
+            failures.append(failure)
+        while not ended.wait(0.1):  # again if that was before the service listened to signals
+            os.kill(os.getpid(), signal.SIGTERM)
 
-        thread = threading.Thread(target=run)
-        thread.start()
-        yield service
-    thread.join(timeout=10)
-    assert not thread.is_alive()
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    thread = threading.Thread(target=act)
+    thread.start()
+    try:
+        service.run()
+    finally:
+        ended.set()
+        thread.join()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for failure in failures:
+        raise failure
 
 
-def test_q_follows_the_weights_that_the_learner_publishes(endpoint):
+def test_q_follows_the_weights_that_the_learner_publishes(hub, client):
     sac, version = SAC(OPEN), Version(epoch=1, counter=5)
     weights = {"blob": encode(pack(version, sac.critic_state()))}
-    with running(endpoint) as service, open_client(make_link(endpoint), patience=10.0) as client:
-        _learner = QueryServer(client, KEYS.weights("critic"), lambda *_: weights["blob"])
+    service = CurriculumService(hub, "run-1", OPEN, DIGEST, None)
+    _learner = QueryServer(client, KEYS.weights("critic"), lambda *_: weights["blob"])
+
+    def learn() -> None:
         message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed) for seed in range(2)])
         assert deliver(client, KEYS.candidates, message, 0) == STORED
         for newer in (version, Version(epoch=2, counter=0)):
@@ -295,6 +306,9 @@ def test_q_follows_the_weights_that_the_learner_publishes(endpoint):
             (proposal,) = query(client)
             assert proposal.q_reason == "critic"
             assert proposal.q is not None
+
+    run_during(service, learn)
+    service.close()
 
 
 def test_command_prints_one_json_object_with_the_keys_that_programs_read(endpoint, hub, started):

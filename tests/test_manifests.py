@@ -475,15 +475,19 @@ def test_unit_has_what_its_command_uses(file):
 
 
 @each_unit
-def test_unit_always_comes_back(file):
-    found = settings(file)
-    for name, value in {
-        "Restart": "always",
-        "StartLimitIntervalSec": "0",
-        "WantedBy": "multi-user.target",
-    }.items():
-        assert found[name] == [value]
-    assert int(found["TimeoutStopSec"][0]) >= 10
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("Restart", "always"),
+        ("StartLimitIntervalSec", "0"),
+        ("WantedBy", "multi-user.target"),
+        ("DynamicUser", "yes"),
+        ("ProtectSystem", "strict"),
+        ("TimeoutStopSec", "30"),
+    ],
+)
+def test_unit_always_comes_back_and_never_as_root(file, name, value):
+    assert settings(file)[name] == [value]
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd-analyze is not here")

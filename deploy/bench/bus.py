@@ -369,7 +369,7 @@ def _load(
     config = override(config.model_dump(mode="json"), (*UNLIMITED, room))
     (folder / CONFIG).write_text(config.to_toml(), "utf-8")
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    limits, loads, cpu = list[float](), list[float](), list[float]()
+    limits, loads, limits_cpu, loads_cpu = (list[float]() for _ in range(4))
     with ExitStack() as stack:
         note("the learner starts")
         process, ours = stack.enter_context(_learner(folder, endpoint))
@@ -382,15 +382,16 @@ def _load(
             peer.hear()
         before = _resident(process)
         for i in range(rounds + 1):  # the first warms up
-            limit, used = ingest(), _cpu_seconds(process)
+            (limit, limit_cpu), used = ingest(), _cpu_seconds(process)
             for peer in peers:
                 peer.tell([WINDOW, quota if i else 1])
             told = [peer.hear() for peer in peers]
             if i:
                 sent = sum(words["sent"] for words in told)
                 limits.append(limit)
+                limits_cpu.append(limit_cpu)
                 loads.append(max(words["seconds"] for words in told) / sent)
-                cpu.append((_cpu_seconds(process) - used) / sent)
+                loads_cpu.append((_cpu_seconds(process) - used) / sent)
             note(f"{actors} actors, {i} of {rounds}")
         after = _resident(process)
         ends = [peer.finish() for peer in peers]
@@ -405,7 +406,7 @@ def _load(
     report.add(f"load_{actors}_actors_volume", len(payload) / 1e6 / median(loads), "MB/s")
     report.add("load_acknowledged_p50", float(waited[0]), "ms")
     report.add("load_acknowledged_p99", float(waited[1]), "ms")
-    report.add("load_learner_cores", median(a / b for a, b in zip(cpu, loads, strict=True)), "cores")
+    report.add("load_learner_cores", median(a / b for a, b in zip(loads_cpu, loads, strict=True)), "cores")
     report.add("load_learner_rss", after, "MB")
     report.add("load_learner_rss_before", before, "MB")
     report.add("load_sent", len(expected), "episodes")
@@ -414,11 +415,13 @@ def _load(
     report.add("load_refused", sum(end["refused"] for end in ends), "episodes")
     report.add("ingest_limit", 1 / median(limits), "episodes/s")
     report.compare("load_over_ingest_limit", limits, loads)
-    report.compare("load_cpu_over_ingest_limit", limits, cpu)
+    report.compare("load_over_ingest_limit_cpu", limits_cpu, loads_cpu)
 
 
-def _ingest(config: Config, ours: dict[str, str], payload: bytes, folder: Path) -> Callable[[], float]:
-    """Measures what an episode costs a learner besides the bus, in seconds."""
+def _ingest(
+    config: Config, ours: dict[str, str], payload: bytes, folder: Path
+) -> Callable[[], tuple[float, float]]:
+    """Measures what an episode costs a learner besides the bus: seconds, and seconds of CPU."""
     learner, log = Learner(config), EpisodeLog(folder, config.replay.capacity)
     take, numbers = make_take(config, ours, log), count()
 
@@ -428,7 +431,12 @@ def _ingest(config: Config, ours: dict[str, str], payload: bytes, folder: Path) 
             log.commit()
             learner.insert(episode, log.env_steps - episode.length)
 
-    return lambda: _time(work) / INGESTED
+    def measure() -> tuple[float, float]:
+        before = time.process_time()
+        taken = _time(work)
+        return taken / INGESTED, (time.process_time() - before) / INGESTED
+
+    return measure
 
 
 def _shares(actors: int) -> list[tuple[int, int]]:
