@@ -15,12 +15,12 @@ import zenoh
 
 from actor.inference import Eyes, PolicyActor
 from actor.rollout import Finished, Rollout
-from common.bus import Keys, Member, NoAnswerError, RefusedError, announce, ask_later
+from common.bus import Keys, Member, announce, ask_later
 from common.config import Config
 from common.contract import CONTRACT_DIFFERS
 from common.delivery import Sender, Spool, count_life
 from common.encoders import unpack_encoder
-from common.errors import RunError, UsageError
+from common.errors import NoAnswerError, RefusedError, RunError, UsageError
 from common.messages import (
     Candidate,
     Candidates,

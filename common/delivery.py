@@ -23,7 +23,8 @@ from typing import NamedTuple
 import msgpack
 import zenoh
 
-from common.bus import BUSY, INTERNAL_ERROR, Member, QueryServer, RefusedError, ask_later
+from common.bus import BUSY, INTERNAL_ERROR, Member, QueryServer, ask_later
+from common.errors import RefusedError
 from common.messages import BUNDLE, Message, MessageError, Origin, Receipt, decode, encode
 from common.telemetry import Quantiles
 

@@ -9,3 +9,11 @@ class UsageError(Exception):
 
 class RunError(Exception):
     """A run that cannot go on: the message says in one sentence why, and what becomes of it."""
+
+
+class NoAnswerError(Exception):
+    """Nobody answered: no receiver, a timeout, or a dead peer."""
+
+
+class RefusedError(Exception):
+    """The receiver answered with an error; the text is its reason."""

@@ -13,7 +13,8 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from common.bus import Keys, NoAnswerError, RefusedError, Subscription, ask
+from common.bus import Keys, Subscription, ask
+from common.errors import NoAnswerError, RefusedError
 from common.messages import MessageError, Nothing, Version, WeightsBlob
 from common.telemetry import Quantiles
 

@@ -15,12 +15,12 @@ import torch
 from PIL import Image
 
 from actor.frames import PROBE_SETS, film_all, probe_tasks
-from common.bus import Link, open_hub
 from common.config import Config
 from common.encoders import ENCODER, HEADS, pack_encoder, read_encoder
 from common.errors import UsageError
 from common.files import content_hash
 from common.frames import FrameTable
+from common.link import Link, open_hub
 from common.networks import compile_encoder, export_onnx, load_state, make_encoder, state_of
 from common.policy_files import CONFIG, load_tensors, save_folder
 from deploy.launcher import Child, Supervisor

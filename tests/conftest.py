@@ -9,7 +9,7 @@ import pytest
 import zenoh
 from hypothesis import HealthCheck, settings
 
-from common.bus import make_link, open_client, open_hub
+from common.link import make_link, open_client, open_hub
 from tests.crew import Crew
 from tests.helpers import free_endpoint
 

@@ -14,7 +14,8 @@ import numpy as np
 import zenoh
 
 from common.access import LOCAL
-from common.bus import Keys, Member, Subscription, make_link, open_client
+from common.bus import Keys, Member, Subscription
+from common.link import make_link, open_client
 from common.members import Members
 from common.messages import Stat, Version
 from learner.log import EpisodeLog, Record

@@ -10,8 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-from common.bus import make_link, open_hub
 from common.delivery import DuplicateFilter, Receiver
+from common.link import make_link, open_hub
 from common.messages import MEGABYTE, Origin
 
 

@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from common.access import LOCAL
-from common.bus import Keys, Member, announce, ask_later, end_process, make_link, open_client
+from common.bus import Keys, Member, announce, ask_later
 from common.contract import accept_contract, fetch_contract
 from common.delivery import Sender, Spool
 from common.errors import UsageError
+from common.link import end_process, make_link, open_client
 from common.messages import Candidate, Candidates, Outcome, TaskQuery, encode
 from common.tasks import GeometricProperties
 from common.telemetry import Reporter, exit_on_signals, start_logging, stop_on_signals

@@ -36,22 +36,17 @@ from common.bus import (
     EVERYBODY,
     Keys,
     Member,
-    NoAnswerError,
     QueryServer,
-    RefusedError,
     Subscription,
     announce,
     ask_bytes,
-    make_link,
-    open_client,
-    open_hub,
-    open_router,
     publish,
     watch_members,
 )
 from common.contract import fetch_contract
 from common.delivery import DuplicateFilter, Parcel, Receiver, Sender, Spool, pack_bundle
-from common.errors import UsageError
+from common.errors import NoAnswerError, RefusedError, UsageError
+from common.link import make_link, open_client, open_hub, open_router
 from common.messages import (
     MEGABYTE,
     PROTOCOL,

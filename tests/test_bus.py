@@ -16,29 +16,23 @@ from common.bus import (
     GROUP,
     INBOX_BYTES,
     INTERNAL_ERROR,
-    LARGEST_MESSAGE,
     LOGGED,
     Keys,
     Member,
-    NoAnswerError,
     QueryServer,
-    RefusedError,
     Subscription,
     announce,
     ask,
     ask_bytes,
     ask_later,
     list_members,
-    make_link,
-    open_client,
-    open_hub,
-    open_router,
     publish,
     serve,
     watch_members,
 )
 from common.delivery import BUNDLE_BYTES
-from common.errors import UsageError
+from common.errors import NoAnswerError, RefusedError, UsageError
+from common.link import LARGEST_MESSAGE, make_link, open_client, open_hub, open_router
 from common.messages import (
     MEGABYTE,
     PROTOCOL,
@@ -56,7 +50,8 @@ KEYS = Keys("run-1")
 A = Member("actor", "local", "a")
 ECHO_HUB = """
 import sys, time
-from common.bus import QueryServer, make_link, open_hub
+from common.bus import QueryServer
+from common.link import make_link, open_hub
 with open_hub(make_link(sys.argv[1])) as hub:
     server = QueryServer(hub, "navaclq/run-1/echo", lambda payload, *_: payload)
     print("up", flush=True)
@@ -870,7 +865,8 @@ def test_a_killed_member_is_seen_leaving(endpoint, hub):
     events: list[tuple[Member, str, bool]] = []
     watch = watch_members(hub, KEYS, lambda *event: events.append(event))
     script = (
-        "import sys, time; from common.bus import Keys, Member, announce, make_link, open_client\n"
+        "import sys, time; from common.bus import Keys, Member, announce\n"
+        "from common.link import make_link, open_client\n"
         "with open_client(make_link(sys.argv[1])) as session:\n"
         "    token = announce(session, Keys('run-1'), Member('actor', 'local', 'victim')); time.sleep(60)"
     )

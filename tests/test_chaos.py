@@ -14,7 +14,9 @@ from typing import NamedTuple
 import pytest
 import zenoh
 
-from common.bus import Keys, NoAnswerError, RefusedError, ask, make_link, open_client
+from common.bus import Keys, ask
+from common.errors import NoAnswerError, RefusedError
+from common.link import make_link, open_client
 from common.members import Members
 from common.messages import ContractReply, Nothing
 from learner.log import EpisodeLog

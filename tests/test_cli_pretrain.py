@@ -16,10 +16,11 @@ import pytest
 import torch
 from PIL import Image
 
-from common.bus import Keys, make_link, open_client, open_hub
+from common.bus import Keys
 from common.config import resolve
 from common.contract import digest, fetch_contract
 from common.encoders import frozen_encoder, read_encoder
+from common.link import make_link, open_client, open_hub
 from common.messages import Frames
 from common.tasks import Task
 from deploy.bench.encoder import SIZES

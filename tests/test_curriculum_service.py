@@ -10,21 +10,12 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
-from common.bus import (
-    INTERNAL_ERROR,
-    Keys,
-    Member,
-    QueryServer,
-    RefusedError,
-    ask,
-    ask_bytes,
-    publish,
-)
+from common.bus import INTERNAL_ERROR, Keys, Member, QueryServer, ask, ask_bytes, publish
 from common.config import Config
 from common.contract import make_contract
 from common.delivery import DAMAGED, Sender, Spool, pack_bundle
 from common.encoders import pack_encoder
-from common.errors import UsageError
+from common.errors import RefusedError, UsageError
 from common.messages import (
     Candidates,
     Outcome,

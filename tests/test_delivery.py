@@ -15,17 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import bus
-from common.bus import (
-    BUSY,
-    INTERNAL_ERROR,
-    Member,
-    QueryServer,
-    RefusedError,
-    ask_bytes,
-    make_link,
-    open_client,
-    open_hub,
-)
+from common.bus import BUSY, INTERNAL_ERROR, Member, QueryServer, ask_bytes
 from common.delivery import (
     BUNDLE_BYTES,
     DAMAGED,
@@ -37,6 +27,8 @@ from common.delivery import (
     pack_bundle,
     unpack_bundle,
 )
+from common.errors import RefusedError
+from common.link import make_link, open_client, open_hub
 from common.messages import BUNDLE, Frames, MessageError, Origin, Receipt, TaskQuery, decode, encode
 from tests.helpers import STORED, deliver, deliver_all, parcel, reason, wait_until
 

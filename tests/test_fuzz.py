@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from common.bus import BUSY, Keys, Member, QueryServer, RefusedError, Subscription, ask_later
+from common.bus import BUSY, Keys, Member, QueryServer, Subscription, ask_later
 from common.config import override
+from common.errors import RefusedError
 from common.members import Members
 from common.messages import (
     PROTOCOL,

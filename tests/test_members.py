@@ -10,7 +10,8 @@ import pytest
 import zenoh
 
 from common import members as module
-from common.bus import Keys, Member, announce, make_link, open_client, publish
+from common.bus import Keys, Member, announce, publish
+from common.link import make_link, open_client
 from common.members import MOST, Members
 from common.messages import PROTOCOL, Stat
 from common.telemetry import Reporter
@@ -93,7 +94,8 @@ def test_those_that_were_there_before_are_alive_too(hub, client):
 
 def test_a_killed_process_is_missed(endpoint, heard):
     script = (
-        "import sys, time; from common.bus import Keys, Member, announce, make_link, open_client\n"
+        "import sys, time; from common.bus import Keys, Member, announce\n"
+        "from common.link import make_link, open_client\n"
         "with open_client(make_link(sys.argv[1])) as session:\n"
         "    token = announce(session, Keys('run-1'), Member('actor', 'local', 'a')); time.sleep(60)"
     )

@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 
 from common.access import LOCAL
-from common.bus import Keys, Member, RefusedError, ask_bytes, make_link, open_client
+from common.bus import Keys, Member, ask_bytes
 from common.contract import fetch_contract
 from common.delivery import DAMAGED, pack_bundle
+from common.errors import RefusedError
+from common.link import make_link, open_client
 from common.members import Members
 from tests.crew import SMOKE, Processes
 from tests.helpers import deliver, deliver_all, free_endpoint, parcel, reason, tiny_episode, wait_until

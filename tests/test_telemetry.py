@@ -21,7 +21,7 @@ from tests.helpers import wait_until
 
 SCRIPT = """
 import sys, time
-from common.bus import make_link, open_hub
+from common.link import make_link, open_hub
 from common.telemetry import exit_on_signals
 exit_on_signals()
 try:

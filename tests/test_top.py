@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from common.access import Credentials
-from common.bus import Keys, Link, Member, announce, list_members, make_link, open_client, open_hub
+from common.bus import Keys, Member, announce, list_members
+from common.link import Link, make_link, open_client, open_hub
 from common.members import Members
 from common.messages import PROTOCOL, Stat
 from common.telemetry import Reporter

@@ -30,11 +30,12 @@ import numpy as np
 import zenoh
 
 from common.access import LOCAL
-from common.bus import Member, NoAnswerError, RefusedError, ask_bytes, ask_later, make_link, open_client
+from common.bus import Member, ask_bytes, ask_later
 from common.config import Config, override
 from common.contract import digest, fetch_contract
 from common.delivery import Parcel, Sender, Spool, pack_bundle
-from common.errors import RunError
+from common.errors import NoAnswerError, RefusedError, RunError
+from common.link import make_link, open_client
 from common.messages import Episode, Origin, Receipt, decode, encode
 from common.observation import Columns, ObservationLayout
 from deploy.bench.bus_peers import CONFIG, DURABILITIES, EPISODE, PATIENCE, RUN, channel, make_take

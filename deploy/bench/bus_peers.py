@@ -17,10 +17,11 @@ from typing import Any
 import zenoh
 
 from common.access import LOCAL
-from common.bus import Keys, Member, make_link, open_client, open_hub
+from common.bus import Keys, Member
 from common.config import Config, parse
 from common.contract import check_digest, digest
 from common.delivery import Receiver, Sender, Spool
+from common.link import make_link, open_client, open_hub
 from common.messages import Episode, Origin, decode
 from common.observation import ObservationLayout
 from common.telemetry import Quantiles

@@ -8,7 +8,7 @@ from typing import NoReturn
 def run() -> NoReturn:
     """Loads the commands, during which Ctrl-C ends the process without a word, and runs one."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from common.bus import end_process
+    from common.link import end_process
     from deploy.cli.main import run as run_command
 
     try:

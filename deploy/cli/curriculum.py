@@ -11,9 +11,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import Keys, Link, ask, open_client, open_hub
+from common.bus import Keys, ask
 from common.cells import check_cell
 from common.errors import UsageError
+from common.link import Link, open_client, open_hub
 from common.messages import Proposals, TaskQuery
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options

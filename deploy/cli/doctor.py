@@ -14,8 +14,9 @@ from typing import Annotated, Any
 import typer
 
 from common.access import ROLES
-from common.bus import Keys, Link, Member, NoAnswerError, RefusedError, list_members, open_client
-from common.errors import RunError, UsageError
+from common.bus import Keys, Member, list_members
+from common.errors import NoAnswerError, RefusedError, RunError, UsageError
+from common.link import Link, open_client
 from common.messages import PROTOCOL, MessageError
 from deploy.cli import options
 

@@ -9,8 +9,7 @@ from typing import NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from common.bus import NoAnswerError, RefusedError
-from common.errors import RunError, UsageError
+from common.errors import NoAnswerError, RefusedError, RunError, UsageError
 from common.messages import MessageError
 from deploy.cli import (
     bench,

@@ -16,13 +16,13 @@ import typer
 from rich.console import Console
 from rich.progress import Progress, TextColumn
 
-from common import bus
+from common import link
 from common.access import load_credentials
-from common.bus import Link
 from common.cells import ROOM_NAMES, check_cell
 from common.config import Config, resolve
 from common.errors import UsageError
 from common.files import write_atomically
+from common.link import Link
 from common.tasks import DollyShift, PlacedStart, Task
 from common.world_config import StartRanges, WorldConfig
 
@@ -94,7 +94,7 @@ def configuration(
 
 def make_link(text: str, certs: Path | None, insecure: bool) -> Link:
     """The link that the options --connect or --listen, --certs and --insecure ask for."""
-    return bus.make_link(text, load_credentials(certs) if certs else None, insecure)
+    return link.make_link(text, load_credentials(certs) if certs else None, insecure)
 
 
 def make_task(world: WorldConfig, room: str, seed: int, place: str | None, shift: str | None) -> Task:

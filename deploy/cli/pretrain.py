@@ -11,8 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import Link
 from common.config import Config, Objective
+from common.link import Link
 from common.telemetry import exit_on_signals
 from deploy.cli import options
 from deploy.launcher import free_port

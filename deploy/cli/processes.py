@@ -16,9 +16,10 @@ from typing import IO, Annotated
 
 import typer
 
-from common.bus import Member, open_client, open_hub, open_router
+from common.bus import Member
 from common.errors import UsageError
 from common.files import lock
+from common.link import open_client, open_hub, open_router
 from common.telemetry import exit_on_signals, start_logging, stop_on_signals
 from deploy.cli import options
 

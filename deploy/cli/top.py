@@ -12,7 +12,8 @@ import typer
 import zenoh
 from rich.console import Console
 
-from common.bus import Keys, Link, ask_later, list_members, open_client
+from common.bus import Keys, ask_later, list_members
+from common.link import Link, open_client
 from common.members import Members
 from common.messages import ContractReply, MessageError, Nothing, decode, encode
 from common.telemetry import exit_on_signals

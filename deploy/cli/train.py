@@ -12,10 +12,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from common.bus import Keys, make_link, open_client
+from common.bus import Keys
 from common.config import Config, parse, resolve
 from common.contract import fetch_contract
 from common.errors import UsageError
+from common.link import make_link, open_client
 from common.members import Members
 from common.messages import ContractReply
 from common.resources import learner_threads
