@@ -19,6 +19,17 @@ settings.register_profile(
 settings.load_profile("repeatable")
 
 
+WHOLE_SYSTEMS = ("chaos", "cli_pretrain", "damage", "hosts", "interrupt", "kills", "system", "top")
+"""Files whose tests start several processes: never two of them at a time."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What `--dist loadgroup` keeps together: the tests of a file, and all tests of whole systems."""
+    for item in items:
+        name = item.path.stem.removeprefix("test_")
+        item.add_marker(pytest.mark.xdist_group("systems" if name in WHOLE_SYSTEMS else name))
+
+
 @pytest.fixture
 def endpoint() -> str:
     """A loopback endpoint that nobody listens on yet."""

@@ -28,6 +28,7 @@ def processes(tmp_path):
     found.close()
 
 
+@pytest.mark.slow  # in the ordinary suite test_hosts.py has processes started by hand
 @pytest.mark.timeout(240)
 def test_four_processes_started_by_hand_train_and_survive_the_loss_of_one(processes, tmp_path):
     endpoint, run = free_endpoint(), tmp_path / "hand"
