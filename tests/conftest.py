@@ -23,6 +23,7 @@ WHOLE_SYSTEMS = ("chaos", "cli_pretrain", "damage", "hosts", "interrupt", "kills
 """Files whose tests start several processes: never two of them at a time."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist looks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What `--dist loadgroup` keeps together: the tests of a file, and all tests of whole systems."""
     for item in items:
