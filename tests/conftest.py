@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from hypothesis import HealthCheck, settings
+from xdist.scheduler import LoadScopeScheduling
 
 from common.link import make_link, open_client, open_hub
 from tests.crew import Crew
@@ -23,12 +24,16 @@ WHOLE_SYSTEMS = ("chaos", "cli_pretrain", "damage", "hosts", "interrupt", "kills
 """Files whose tests start several processes: never two of them at a time."""
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist looks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What `--dist loadgroup` keeps together: the tests of a file, and all tests of whole systems."""
-    for item in items:
-        name = item.path.stem.removeprefix("test_")
-        item.add_marker(pytest.mark.xdist_group("systems" if name in WHOLE_SYSTEMS else name))
+class Files(LoadScopeScheduling):
+    """Gives xdist's workers whole files, and all those of whole systems to one of them."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = nodeid.partition("::")[0]
+        return "systems" if Path(file).stem.removeprefix("test_") in WHOLE_SYSTEMS else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> Files:
+    return Files(config, log)
 
 
 @pytest.fixture

@@ -54,6 +54,8 @@ SMALL, SMALL_COUNT = 4 * 1024, 1000
 """The messages that show what bundles are good for."""
 MOST_LOST = 10
 """Measurements that are repeated before the benchmark gives up."""
+RECOVERY = 2.0
+"""Seconds in which a lost connection is renewed, with all that the other side declares."""
 MEMBER = Member("actor", LOCAL, "bench")
 WINDOW = 1.5
 """Seconds of load in a round."""
@@ -223,6 +225,7 @@ class _Ways:
                 self.lost += 1
                 if self.lost > MOST_LOST:
                     raise
+                time.sleep(RECOVERY)
                 self.wait()
 
     def acknowledged(self, durability: str, episode: Episode, payload: bytes, n: int) -> None:
