@@ -16,7 +16,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import zenoh
 
@@ -25,7 +25,6 @@ from common.errors import NoAnswerError, RefusedError, UsageError
 from common.messages import MEGABYTE, M, Message, MessageError, decode, encode
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 BUSY = "BUSY"
 """The one refusal that means: again, later."""
@@ -240,17 +239,12 @@ def ask_bytes(
     session: zenoh.Session, key: str, payload: bytes, attachment: bytes = b"", timeout: float = 10.0
 ) -> bytes:
     """The one reply to a query; raises NoAnswerError or RefusedError."""
-    replies = session.get(
-        key,
-        payload=payload,
-        attachment=attachment,
-        timeout=timeout,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-    )
-    for reply in replies:
-        return _read(reply)
-    raise NoAnswerError(f"nobody serves {key}")
+    answers: queue.SimpleQueue[bytes | Exception] = queue.SimpleQueue()
+    ask_later(session, key, payload, answers.put, timeout, attachment)
+    answer = answers.get()
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def ask(
@@ -366,7 +360,8 @@ class Subscription:
 def announce(session: zenoh.Session, keys: Keys, member: Member) -> zenoh.LivelinessToken:
     """Declares this process alive until the returned token is undeclared, or lost.
 
-    Raises UsageError when the name is taken: of two that come at once, at least the second.
+    Raises UsageError when the name is taken: of two that come to one hub at once, at least the second. Behind
+    different routers both may pass, as long as neither has heard of the other.
     """
     own = keys.live(member, uuid.uuid4().hex[:12])
     token = session.liveliness().declare_token(own)

@@ -15,14 +15,13 @@ import signal
 import socket
 import ssl
 import subprocess
-import threading
-from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
+
+from tests.wire import Wire
 
 PREFIX = "navaclq"
 """Namespaces are PREFIX-PID-NAME, by the process that made them."""
@@ -150,8 +149,8 @@ def _remove(namespace: str) -> None:
     subprocess.run(["ip", "netns", "delete", namespace], capture_output=True)
 
 
-class Tunnel:
-    """A port of this machine, `port`, whose connections come out on a host and go on to an address there.
+class Tunnel(Wire):
+    """A wire whose connections come out on a host and go on to an address there.
 
     With `tls` they are plain on this side and encrypted on that.
     """
@@ -160,56 +159,19 @@ class Tunnel:
         self._target, self._tls = (address, port), tls
         self._inside = ThreadPoolExecutor(1, "tunnel", _enter, (host.namespace,))
         """A thread on the host: a socket stays where it was made, whoever uses it."""
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="tunnel", daemon=True)
-        self._thread.start()
-        self._open: set[asyncio.StreamWriter] = set()
-        self._server = self._do(asyncio.start_server(self._join, "127.0.0.1", 0))
-        self.port: int = self._server.sockets[0].getsockname()[1]
+        super().__init__(port)
+
+    async def _reach(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        loop = asyncio.get_running_loop()
+        there = await loop.run_in_executor(self._inside, socket.create_connection, self._target, 5.0)
+        there.setblocking(False)
+        name = self._target[0] if self._tls else None
+        return await asyncio.open_connection(sock=there, ssl=self._tls, server_hostname=name)
 
     def close(self) -> None:
-        """Ends all connections."""
-        self._do(self._end())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        """Ends everything."""
+        super().close()
         self._inside.shutdown()
-
-    def _do(self, work: Coroutine[Any, Any, Any]) -> Any:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(10)
-
-    async def _end(self) -> None:
-        self._server.close()
-        for writer in self._open:
-            writer.transport.abort()
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        await asyncio.gather(*others, return_exceptions=True)
-
-    async def _join(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            there = await self._loop.run_in_executor(
-                self._inside, socket.create_connection, self._target, 5.0
-            )
-            there.setblocking(False)
-            name = self._target[0] if self._tls else None
-            far_reader, far_writer = await asyncio.open_connection(
-                sock=there, ssl=self._tls, server_hostname=name
-            )
-        except OSError:  # nobody listens there yet
-            writer.transport.abort()
-            return
-        ends = {writer, far_writer}
-        self._open |= ends
-        await asyncio.gather(_pass(reader, far_writer), _pass(far_reader, writer))
-        self._open -= ends
-
-
-async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    with suppress(OSError):
-        while data := await reader.read(2**16):
-            writer.write(data)
-            await writer.drain()
-    writer.close()
 
 
 def _enter(namespace: str) -> None:

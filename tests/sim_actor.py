@@ -14,6 +14,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+import zenoh
 
 from common.access import LOCAL
 from common.bus import Keys, Member, announce, ask_later
@@ -21,13 +22,38 @@ from common.contract import accept_contract, fetch_contract
 from common.delivery import Sender, Spool
 from common.errors import UsageError
 from common.link import end_process, make_link, open_client
-from common.messages import Candidate, Candidates, Outcome, TaskQuery, encode
+from common.messages import Candidate, Candidates, Episode, Outcome, TaskQuery, encode
 from common.tasks import GeometricProperties
 from common.telemetry import Reporter, exit_on_signals, start_logging, stop_on_signals
 from common.weights import WeightsPuller
 from tests.helpers import tiny_episode
 
 SPOOL_BYTES = 2**20
+
+
+def outcome_and_candidate(episode: Episode, proposal: str) -> tuple[Outcome, Candidates]:
+    """What an actor also reports, to the curriculum."""
+    numbers = dict.fromkeys(GeometricProperties.model_fields, 0.5)
+    outcome = Outcome(
+        digest=episode.digest,
+        proposal=proposal,
+        task=episode.task,
+        properties=GeometricProperties(**numbers),
+        q=None,
+        success=True,
+        category="random",
+    )
+    row = Candidate(task=episode.task, visual=episode.visual[0], lidar=episode.lidar[0])
+    return outcome, Candidates(digest=episode.digest, candidates=[row])
+
+
+def announce_soon(session: zenoh.Session, keys: Keys, member: Member) -> zenoh.LivelinessToken:
+    """Waits for the token of a former life, which lasts until the lease ends when that was cut off."""
+    while True:
+        try:
+            return announce(session, keys, member)
+        except UsageError:
+            time.sleep(0.5)
 
 
 def main(endpoint: str, name: str, spool: Path, journal: Path) -> None:
@@ -39,70 +65,36 @@ def main(endpoint: str, name: str, spool: Path, journal: Path) -> None:
     with open_client(make_link(endpoint)) as session, journal.open("a", buffering=1) as lines:
         contract = fetch_contract(session)
         config, keys = accept_contract(contract), Keys(contract.run)
-        while True:
-            try:
-                token = announce(session, keys, member)
-                break
-            except UsageError:  # the token of a life that was cut off lasts until the lease ends
-                time.sleep(0.5)
+        token = announce_soon(session, keys, member)
         weights = WeightsPuller(session, keys, "policy")
         reporter = Reporter(session, keys, member)
         episodes = Sender(session, Spool(spool / "learner", SPOOL_BYTES), member, boot)
         reports = Sender(session, Spool(spool / "curriculum", SPOOL_BYTES), member, boot, timeout=5.0)
-        seq = full = answered = 0
-
-        def count(answer: bytes | Exception) -> None:
-            nonlocal answered
-            answered += isinstance(answer, bytes)
-
+        seq = full = 0
         stopping = stop_on_signals()
-        try:
-            while not stopping.is_set():
-                if episodes.spool.full or episodes.held_back:
-                    full += episodes.spool.full
-                    time.sleep(0.01)
-                else:
-                    steps = int(rng.integers(1, config.world.max_episode_steps))
-                    episode = tiny_episode(config, steps, seq, digest=contract.digest)
-                    payload = encode(episode)
-                    lines.write(f"made {boot} {seq} {zlib.crc32(payload)}\n")
-                    episodes.put(keys.trajectory, episode)
-                    lines.write(f"kept {boot} {seq}\n")
-                    seq += 1
-                    task = episode.task
-                    if seq % 4 == 0:
-                        ask_later(session, keys.task, encode(TaskQuery(cell=task.cell)), count, 2.0)
-                        if not reports.spool.full:
-                            numbers = dict.fromkeys(GeometricProperties.model_fields, 0.5)
-                            reports.put(
-                                keys.result,
-                                Outcome(
-                                    digest=contract.digest,
-                                    proposal=f"{name}-{boot}-{seq}",
-                                    task=task,
-                                    properties=GeometricProperties(**numbers),
-                                    q=None,
-                                    success=True,
-                                    category="random",
-                                ),
-                            )
-                            row = Candidate(task=task, visual=episode.visual[0], lidar=episode.lidar[0])
-                            reports.put(keys.candidates, Candidates(digest=contract.digest, candidates=[row]))
-                if reporter.due:
-                    reporter.report(
-                        {
-                            "acknowledged": episodes.sent,
-                            "reported": reports.sent,
-                            "refused": sum((episodes.refused + reports.refused).values()),
-                            "full": full,
-                            "answered": answered,
-                            "weights": weights.newest[0].counter if weights.newest else 0,
-                        }
-                    )
-        finally:
-            episodes.close(patience=0.5)
-            reports.close(patience=0.1)
-            token.undeclare()
+        while not stopping.is_set():
+            if reporter.due:
+                reporter.report({"acknowledged": episodes.sent, "full": full})
+            if episodes.spool.full or episodes.held_back:
+                full += episodes.spool.full
+                time.sleep(0.01)
+                continue
+            steps = int(rng.integers(1, config.world.max_episode_steps))
+            episode = tiny_episode(config, steps, seq, digest=contract.digest)
+            lines.write(f"made {boot} {seq} {zlib.crc32(encode(episode))}\n")
+            episodes.put(keys.trajectory, episode)
+            lines.write(f"kept {boot} {seq}\n")
+            if seq % 4 == 0 and not reports.spool.full:
+                question = encode(TaskQuery(cell=episode.task.cell))
+                ask_later(session, keys.task, question, lambda answer: None, 2.0)
+                outcome, candidates = outcome_and_candidate(episode, f"{name}-{boot}-{seq}")
+                reports.put(keys.result, outcome)
+                reports.put(keys.candidates, candidates)
+            seq += 1
+        episodes.close(patience=0.5)
+        reports.close(patience=0.1)
+        token.undeclare()
+        del weights
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ class Hosts(Crew):
             operator = ssl.create_default_context(cafile=own / "ca.pem")
             operator.load_cert_chain(own / "cert.pem", own / "key.pem")
         self.tunnel = Tunnel(self.centre, self.centre.address, PORT, operator)
-        self.endpoint = f"tcp/127.0.0.1:{self.tunnel.port}"
+        self.endpoint = self.tunnel.endpoint
 
     def start_all(self) -> None:
         self.start_learner()
