@@ -12,7 +12,6 @@ import queue
 import random
 import threading
 import time
-import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from functools import partial
@@ -22,6 +21,7 @@ from typing import NamedTuple
 
 import msgpack
 import zenoh
+from isal.isal_zlib import crc32
 
 from common.bus import BUSY, INTERNAL_ERROR, Member, QueryServer, ask_later
 from common.errors import RefusedError
@@ -47,6 +47,11 @@ class Parcel(NamedTuple):
     origin: Origin
     crc: int
     payload: bytes
+
+    @classmethod
+    def of(cls, origin: Origin, payload: bytes) -> Parcel:
+        """A message with the checksum that belongs to it."""
+        return cls(origin, crc32(payload), payload)
 
 
 Bundle = dict[Path, Parcel]
@@ -83,16 +88,16 @@ def unpack_bundle(payload: bytes, attachment: bytes) -> list[Parcel]:
 class Receiver(QueryServer):
     """Takes in what Senders deliver on `CHANNEL/GROUP/NAME`, each message once.
 
-    `take` gets (origin, payload), and the message is acknowledged after it and `commit` have returned. It may
-    raise MessageError, which refuses the message for good unless the reason is BUSY; any other error means:
-    later. A message that `seen` knows is acknowledged again. A sender may speak only for itself.
+    `take` gets a message whose checksum fits, which is acknowledged after it and `commit` have returned. It
+    may raise MessageError, which refuses the message for good unless the reason is BUSY; any other error
+    means: later. A message that `seen` knows is acknowledged again. A sender may speak only for itself.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         channel: str,
-        take: Callable[[Origin, bytes], None],
+        take: Callable[[Parcel], None],
         seen: Callable[[Origin], bool],
         max_bytes: int,
         commit: Callable[[], None] | None = None,
@@ -113,12 +118,12 @@ class Receiver(QueryServer):
     def _receive_one(self, parcel: Parcel, key: str) -> str:
         """Empty when it is here, else why not."""
         try:
-            if parcel.crc != zlib.crc32(parcel.payload):
+            if parcel.crc != crc32(parcel.payload):
                 raise MessageError(DAMAGED)
             if self._seen(parcel.origin):
                 self.duplicates += 1
             else:
-                self._take(parcel.origin, parcel.payload)
+                self._take(parcel)
             return ""
         except MessageError as error:
             if str(error) != BUSY:
@@ -155,7 +160,7 @@ class Spool:
         """Adds a message; the caller looks at `full` first."""
         path = self.folder / origin.boot / f"{origin.seq:012d}.msg"
         path.parent.mkdir(exist_ok=True)
-        record = msgpack.packb([channel, origin.actor, origin.boot, origin.seq, zlib.crc32(payload), payload])
+        record = msgpack.packb([channel, origin.actor, origin.boot, origin.seq, crc32(payload), payload])
         part = path.with_suffix(".part")
         part.write_bytes(record)
         part.rename(path)
@@ -186,7 +191,7 @@ class Spool:
     def _read(self, path: Path) -> tuple[str, Parcel] | None:
         try:
             channel, actor, boot, seq, crc, payload = msgpack.unpackb(path.read_bytes())
-            if crc != zlib.crc32(payload):
+            if crc != crc32(payload):
                 raise ValueError("its checksum does not match")
             return str(channel), Parcel(Origin(actor=actor, boot=boot, seq=seq), crc, payload)
         except (OSError, ValueError, TypeError) as error:  # TypeError: msgpack of something else

@@ -17,12 +17,11 @@ from common.access import LOCAL
 from common.bus import Keys, Member, announce, serve
 from common.config import Config
 from common.contract import check_digest
-from common.delivery import Receiver
+from common.delivery import Parcel, Receiver
 from common.errors import UsageError
 from common.messages import (
     Candidates,
     Message,
-    Origin,
     Outcome,
     Proposals,
     TaskQuery,
@@ -116,13 +115,13 @@ class CurriculumService:
     def _receiver(
         self, session: zenoh.Session, channel: str, kind: type[Report], add: Callable[[Report], None]
     ) -> Receiver:
-        def take(origin: Origin, payload: bytes) -> None:
-            message = decode(kind, payload)
+        def take(parcel: Parcel) -> None:
+            message = decode(kind, parcel.payload)
             if self._digest is not None:
                 check_digest(self._digest, message.digest)
             with self._lock:
                 add(message)
-                self.curriculum.seen.add(origin)
+                self.curriculum.seen.add(parcel.origin)
 
         return Receiver(session, channel, take, self.curriculum.seen.seen, kind.max_bytes)
 

@@ -6,23 +6,23 @@ import json
 import logging
 import os
 import struct
-import zlib
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import msgpack
+from isal.isal_zlib import crc32
 
-from common.delivery import DuplicateFilter
+from common.delivery import DuplicateFilter, Parcel
 from common.errors import UsageError
 from common.files import sync, write_atomically
 from common.messages import Episode, Origin
 
 log = logging.getLogger(__name__)
-HEADER = struct.Struct("<4sII")
-"""Magic, length and CRC-32 of the record that follows."""
-MAGIC = b"NVQ1"
+HEADER = struct.Struct("<4sIIII")
+"""Magic; length and CRC-32 of the counts, length and CRC-32 of the payload, which follow."""
+MAGIC, EARLIER = b"NVQ2", b"NVQ1"
 LARGEST = 2 * Episode.max_bytes
 """More bytes than a record has."""
 
@@ -85,23 +85,25 @@ class EpisodeLog:
             else:
                 self._sizes.append((path, transitions))
 
-    def append(self, origin: Origin, length: int, payload: bytes) -> Record:
+    def append(self, parcel: Parcel, length: int) -> Record:
         """Writes an episode of `length` transitions; it is in the file when this returns.
 
         Raises OSError when it cannot be written, and leaves no trace of it then.
         """
         if self.broken:
             raise self.broken
+        origin, crc, payload = parcel
         record = Record(origin, self.env_steps + length, self.episodes + 1, length, payload)
-        body = msgpack.packb([*origin.model_dump().values(), *record[1:]])
+        counts = msgpack.packb([origin.actor, origin.boot, origin.seq, *record[1:-1]])
+        head = HEADER.pack(MAGIC, len(counts), crc32(counts), len(payload), crc) + counts
         if self._file is None or self._file.tell() >= self._segment_bytes:
             self._next_segment()
         assert self._file is not None
-        data = memoryview(HEADER.pack(MAGIC, len(body), zlib.crc32(body)) + body)
         start = self._file.seek(0, os.SEEK_END)  # after a cut the position lies beyond the end
         try:
-            while data:  # a disk that fills up takes a part, and says why at the next attempt
-                data = data[self._file.write(data) :]
+            written = os.writev(self._file.fileno(), (head, payload))
+            while written < len(head) + len(payload):  # a disk that fills up says why at the next attempt
+                written += self._file.write((head + payload)[written:])
         except OSError:
             self._file.truncate(start)
             raise
@@ -163,26 +165,33 @@ class EpisodeLog:
                 data = file.read(self._segment_bytes + LARGEST)
         except OSError as error:
             raise UsageError(f"cannot read {path}: {error.strerror}") from None
+        if data.startswith(EARLIER):
+            raise UsageError(f"{path} is of an earlier version of navaclq; start a new run")
         position = end = 0
         while (start := data.find(MAGIC, position)) >= 0:
-            body = _body(data, start)
-            if body is None:
+            parts = _parts(data, start)
+            if parts is None:
                 position = start + 1
                 continue
             if start > end:
                 log.warning("%s: skipped %d damaged bytes before a whole record", path, start - end)
-            actor, boot, seq, env_steps, episodes, length, payload = msgpack.unpackb(body)
+            counts, payload = parts
+            actor, boot, seq, env_steps, episodes, length = msgpack.unpackb(counts)
             yield Record(Origin(actor=actor, boot=boot, seq=seq), env_steps, episodes, length, payload)
-            position = end = start + HEADER.size + len(body)
+            position = end = start + HEADER.size + len(counts) + len(payload)
         if end < whole:
             log.warning("%s: cut a torn tail of %d bytes after its last whole record", path, whole - end)
             os.truncate(path, end)
 
 
-def _body(data: bytes, start: int) -> bytes | None:
-    """The body of the record that begins at `start`; None when it is not whole."""
+def _parts(data: bytes, start: int) -> tuple[bytes, bytes] | None:
+    """Counts and payload of the record that begins at `start`; None when it is not whole."""
     if len(data) - start < HEADER.size:
         return None
-    _, size, crc = HEADER.unpack_from(data, start)
-    body = data[start + HEADER.size : start + HEADER.size + size]
-    return body if 0 < size == len(body) and zlib.crc32(body) == crc else None
+    _, size, crc, payload_size, payload_crc = HEADER.unpack_from(data, start)
+    middle = start + HEADER.size + size
+    counts = data[start + HEADER.size : middle]
+    if not 0 < size == len(counts) or crc32(counts) != crc:
+        return None
+    payload = data[middle : middle + payload_size]
+    return (counts, payload) if len(payload) == payload_size and crc32(payload) == payload_crc else None

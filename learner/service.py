@@ -22,7 +22,7 @@ from torch.utils.tensorboard import SummaryWriter
 from common.access import LOCAL
 from common.bus import BUSY, Keys, Member, QueryServer, announce, publish, serve
 from common.contract import check_digest, make_contract
-from common.delivery import Receiver
+from common.delivery import Parcel, Receiver
 from common.encoders import unpack_encoder
 from common.errors import RunError, UsageError
 from common.files import write_atomically
@@ -34,7 +34,6 @@ from common.messages import (
     Message,
     MessageError,
     Nothing,
-    Origin,
     Version,
     decode,
     encode,
@@ -145,7 +144,8 @@ class LearnerService:
         self._blobs_lock = threading.Lock()
         self._publish()
         self._snapshot_due = self._next_snapshot()
-        seen, commit = self._log.seen.seen, self._log.commit
+        seen = self._log.seen.seen
+        commit = self._log.commit if sync else None  # without it each is answered at once
         self._receiver = Receiver(
             session, self.keys.trajectory, self._take, seen, Episode.max_bytes, commit=commit
         )
@@ -268,12 +268,12 @@ class LearnerService:
                     f"cannot write to the run directory {self.run_directory.folder}: {error.strerror}"
                 ) from None
 
-    def _take(self, origin: Origin, payload: bytes) -> None:
+    def _take(self, parcel: Parcel) -> None:
         """From the bus, in a thread of its own: an episode is acknowledged when it is in the log.
 
         It is sent again later when the disk is full, or when the limiter holds the actors back.
         """
-        episode = decode(Episode, payload)
+        episode = decode(Episode, parcel.payload)
         check_digest(self.contract.digest, episode.digest)
         world = self.config.world
         episode.check_layout(self.learner.layout, world.max_episode_steps, world.reward.largest)
@@ -281,7 +281,7 @@ class LearnerService:
         if not self.learner.limiter.may_insert(waiting + episode.length):
             raise MessageError(BUSY)
         try:
-            record = self._log.append(origin, episode.length, payload)
+            record = self._log.append(parcel, episode.length)
         except OSError as error:
             self._complain("an episode", error)
             raise MessageError(BUSY) from None

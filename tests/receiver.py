@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from common.delivery import DuplicateFilter, Receiver
+from common.delivery import DuplicateFilter, Parcel, Receiver
 from common.link import make_link, open_hub
 from common.messages import MEGABYTE, Origin
 
@@ -26,8 +26,9 @@ def main(endpoint: str, channel: str, file: str) -> None:
         seen.add(Origin(actor=actor, boot=boot, seq=int(seq)))
     out = path.open("a")
 
-    def take(origin: Origin, payload: bytes) -> None:
-        out.write(f"{origin.actor} {origin.boot} {origin.seq} {payload.hex()}\n")
+    def take(parcel: Parcel) -> None:
+        origin = parcel.origin
+        out.write(f"{origin.actor} {origin.boot} {origin.seq} {parcel.payload.hex()}\n")
         out.flush()
         seen.add(origin)
         time.sleep(0.001)  # a bundle takes long enough to be killed in the middle of it

@@ -322,9 +322,9 @@ class Store:
         self._seen = DuplicateFilter()
         self.receiver = Receiver(session, channel, self._take, self._seen.seen, MEGABYTE)
 
-    def _take(self, origin: Origin, payload: bytes) -> None:
-        self.stored.append(f"{origin.actor}: {payload.decode()}")
-        self._seen.add(origin)
+    def _take(self, parcel: Parcel) -> None:
+        self.stored.append(f"{parcel.origin.actor}: {parcel.payload.decode()}")
+        self._seen.add(parcel.origin)
 
 
 def deliver(
@@ -394,7 +394,7 @@ def test_an_actor_delivers_under_its_own_name_and_under_no_other(place, keys, tm
     receiver = Receiver(
         place.hub,
         keys.trajectory,
-        lambda origin, payload: stored.append(origin.actor),
+        lambda parcel: stored.append(parcel.origin.actor),
         lambda _: False,
         MEGABYTE,
     )

@@ -485,7 +485,8 @@ class Answers:
         self._seen = DuplicateFilter()
         self.server = Receiver(session, KEY, self._take, self._seen.seen, max_bytes)
 
-    def _take(self, source: Origin, payload: bytes) -> None:
+    def _take(self, parcel: Parcel) -> None:
+        source = parcel.origin
         self.asked.append(source.seq)
         mood = self.mood(source) if callable(self.mood) else self.mood
         if mood is not None:
@@ -586,8 +587,8 @@ def test_final_refusal_behind_busy_ends_the_holding_back(hub, client, spool):
 def test_refused_message_is_dropped_counted_and_does_not_hold_up_the_next(hub, client, spool):
     stored = []
 
-    def take(source: Origin, payload: bytes) -> None:
-        query = decode(TaskQuery, payload)
+    def take(parcel: Parcel) -> None:
+        query = decode(TaskQuery, parcel.payload)
         if query.cell == 0:
             raise MessageError("contract differs in 'reward': this run has 1, got 2")
         stored.append(query.t)
@@ -814,9 +815,9 @@ def test_message_that_is_damaged_on_its_way_comes_again(hub, client, spool):
     taken: dict[int, bytes] = {}
     seen = DuplicateFilter()
 
-    def take(source: Origin, payload: bytes) -> None:
-        taken[source.seq] = payload
-        seen.add(source)
+    def take(parcel: Parcel) -> None:
+        taken[parcel.origin.seq] = parcel.payload
+        seen.add(parcel.origin)
 
     def damage(payload: bytes, attachment: bytes, key: str) -> bytes:
         """Hands the first two deliveries on with a byte flipped."""
@@ -914,9 +915,9 @@ def test_delivery_is_acknowledged_after_the_commit_and_comes_again_when_that_fai
     events: list[str] = []
     seen = DuplicateFilter()
 
-    def take(source: Origin, payload: bytes) -> None:
-        events.append(f"take {source.seq}")
-        seen.add(source)
+    def take(parcel: Parcel) -> None:
+        events.append(f"take {parcel.origin.seq}")
+        seen.add(parcel.origin)
 
     def commit() -> None:
         events.append("commit")

@@ -3,6 +3,7 @@ import json
 import logging
 import os
 import shutil
+import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.delivery import Parcel
 from common.errors import UsageError
 from common.messages import Episode, Origin, decode, encode
 from learner.learner import Learner
@@ -60,7 +62,7 @@ def filled(folder: Path, count: int = 3) -> Path:
     """The one segment of a log of `count` episodes of 1, 2, 3, ... transitions."""
     log, _ = opened(folder)
     for seq in range(count):
-        log.append(origin(seq), seq + 1, f"episode {seq}".encode())
+        log.append(Parcel.of(origin(seq), f"episode {seq}".encode()), seq + 1)
     log.close()
     return folder / "00000001.log"
 
@@ -69,7 +71,7 @@ def test_episodes_come_back_in_order_with_the_counts_after_each(tmp_path):
     log, records = opened(tmp_path / "log")
     assert records == []
     episodes = [tiny_episode(small_config(), steps, seed=steps) for steps in (3, 1, 7)]
-    written = [log.append(origin(i), e.length, encode(e)) for i, e in enumerate(episodes)]
+    written = [log.append(Parcel.of(origin(i), encode(e)), e.length) for i, e in enumerate(episodes)]
     assert (log.env_steps, log.episodes) == (11, 3)
     log.close()
     again, records = opened(tmp_path / "log")
@@ -85,7 +87,7 @@ def test_episodes_come_back_in_order_with_the_counts_after_each(tmp_path):
 
 def test_record_is_on_file_when_append_returns(tmp_path):
     log, _ = opened(tmp_path)
-    log.append(origin(0), 3, b"payload")
+    log.append(Parcel.of(origin(0), b"payload"), 3)
     _, records = opened(tmp_path)  # while the first is still open, as after a SIGKILL
     assert [r.payload for r in records] == [b"payload"]
 
@@ -95,7 +97,7 @@ def test_counts_and_duplicates_go_on_after_a_restart(tmp_path):
     log, _ = opened(tmp_path)
     assert [log.seen.seen(origin(seq)) for seq in range(4)] == [True, True, True, False]
     assert not log.seen.seen(origin(0, boot="b2"))
-    record = log.append(origin(3), 10, b"more")
+    record = log.append(Parcel.of(origin(3), b"more"), 10)
     assert (record.env_steps, record.episodes) == (16, 4)
 
 
@@ -119,8 +121,8 @@ def test_torn_tail_is_cut_and_reported_wherever_the_tear_is_and_appending_goes_o
             assert f"cut a torn tail of {lost} bytes" in caplog.text
         else:
             assert caplog.text == ""
-        log.append(origin(2), 3, b"episode 2")
-        log.append(origin(3), 4, b"episode 3")
+        log.append(Parcel.of(origin(2), b"episode 2"), 3)
+        log.append(Parcel.of(origin(3), b"episode 3"), 4)
         log.close()
         caplog.clear()
         _, records = opened(torn)
@@ -179,7 +181,7 @@ def test_flipped_bit_anywhere_in_the_middle_costs_only_the_record_it_hits(tmp_pa
     assert (tmp_path / "whole" / "00000001.log").stat().st_size == len(whole)
 
 
-@pytest.mark.parametrize("pattern", [b"\x00", b"\xff", b"NVQ1", b"NVQ1\x05\x00\x00\x00\x00\x00\x00\x00"])
+@pytest.mark.parametrize("pattern", [b"\x00", b"\xff", b"NVQ2", b"NVQ2\x05\x00\x00\x00\x00\x00\x00\x00"])
 def test_overwritten_bytes_anywhere_in_the_middle_cost_only_the_record_they_hit(tmp_path, caplog, pattern):
     whole, begin, end = spans(tmp_path)
     for first in range(begin, end):
@@ -217,9 +219,9 @@ def test_appending_goes_on_behind_damage_in_the_middle(tmp_path):
     segment = tmp_path / "whole" / "00000001.log"
     segment.write_bytes(whole[:begin] + b"oops" + whole[begin + 4 :])
     log, _ = opened(segment.parent)
-    record = log.append(origin(5), 6, b"episode 5")
+    record = log.append(Parcel.of(origin(5), b"episode 5"), 6)
     assert (record.env_steps, record.episodes) == (21, 6)
-    again = log.append(origin(2), 3, b"episode 2, which its sender still had")
+    again = log.append(Parcel.of(origin(2), b"episode 2, which its sender still had"), 3)
     assert (again.env_steps, again.episodes) == (24, 7)
     log.close()
     _, records = opened(segment.parent)
@@ -238,7 +240,7 @@ def test_file_of_zeros_after_the_last_record_is_cut(tmp_path):
 def test_damage_in_an_older_segment_spares_the_newer_ones(tmp_path):
     log, _ = opened(tmp_path, segment_bytes=1)  # a segment per episode
     for seq in range(3):
-        log.append(origin(seq), 1, bytes([seq]))
+        log.append(Parcel.of(origin(seq), bytes([seq])), 1)
     log.close()
     middle = tmp_path / "00000002.log"
     middle.write_bytes(middle.read_bytes()[:-1] + b"x")
@@ -250,7 +252,7 @@ def test_damage_in_an_older_segment_spares_the_newer_ones(tmp_path):
 def test_segments_rotate_and_go_when_the_ring_no_longer_needs_them(tmp_path):
     log, _ = opened(tmp_path, capacity=20, segment_bytes=1000)
     for seq in range(200):
-        log.append(origin(seq), 4, bytes(300))
+        log.append(Parcel.of(origin(seq), bytes(300)), 4)
         names = sorted(path.name for path in tmp_path.glob("*.log"))
         assert len(names) <= 4
         kept = sum(r.length for path in names for r in EpisodeLog(tmp_path, 20)._read(tmp_path / path))
@@ -269,7 +271,7 @@ def test_duplicates_of_dropped_episodes_stay_recognised_after_a_restart(tmp_path
     log, _ = opened(tmp_path, capacity=5, segment_bytes=100)
     order = [0, 1, 2, 4, 5, *range(6, 60)]  # 3 never came
     for seq in order:
-        log.append(origin(seq), 4, bytes(60))
+        log.append(Parcel.of(origin(seq), bytes(60)), 4)
     log.close()
     again, records = opened(tmp_path, capacity=5, segment_bytes=100)
     assert {0, 1, 2} & {r.origin.seq for r in records} == set()
@@ -281,7 +283,7 @@ def test_rotation_goes_on_after_a_restart(tmp_path):
         log, records = opened(tmp_path, capacity=20, segment_bytes=400)
         assert sum(r.length for r in records) >= min(20, 4 * start)
         for seq in range(start, start + 10):
-            log.append(origin(seq), 4, bytes(100))
+            log.append(Parcel.of(origin(seq), bytes(100)), 4)
         log.close()
     numbers = sorted(int(path.stem) for path in tmp_path.glob("*.log"))
     assert numbers == list(range(numbers[0], numbers[-1] + 1))
@@ -308,7 +310,7 @@ def test_replay_after_any_number_of_kills_holds_exactly_the_newest_episodes_once
         assert sorted(steps) == [step for span in reversed(kept) for step in span], f"life {life}"
         for _ in range(int(rng.integers(1, 40))):
             episode = tiny_episode(config, int(rng.integers(1, 21)), seed=number)
-            record = log.append(origin(number), episode.length, encode(episode))
+            record = log.append(Parcel.of(origin(number), encode(episode)), episode.length)
             learner.insert(episode, record.env_steps - record.length)
             expected.append(range(record.env_steps - record.length, record.env_steps))
             number += 1
@@ -327,7 +329,7 @@ def test_files_that_are_no_segments_are_left_alone(tmp_path):
     filled(tmp_path)
     (tmp_path / "notes.log").write_text("mine")
     log, records = opened(tmp_path)
-    log.append(origin(3), 1, b"more")
+    log.append(Parcel.of(origin(3), b"more"), 1)
     assert len(records) == 3
     assert (tmp_path / "notes.log").read_text() == "mine"
 
@@ -341,7 +343,7 @@ def test_segment_that_cannot_be_read_is_named(tmp_path):
 
 def test_what_was_appended_before_a_kill_is_committed_before_a_duplicate_is_confirmed(tmp_path, syncs):
     log, _ = opened(tmp_path)
-    log.append(origin(0), 1, b"never committed")
+    log.append(Parcel.of(origin(0), b"never committed"), 1)
     again = EpisodeLog(tmp_path, CAPACITY, sync=True)
     assert len(list(again.restore())) == 1
     assert again.seen.seen(origin(0))
@@ -356,11 +358,11 @@ def test_append_that_fails_for_want_of_space_leaves_no_trace(tmp_path):
     with largest_file(size + 40):
         for _ in range(3):  # the sender tries again
             with pytest.raises(OSError):
-                log.append(origin(3), 4, bytes(100))
+                log.append(Parcel.of(origin(3), bytes(100)), 4)
             assert segment.stat().st_size == size
     assert not log.seen.seen(origin(3))
     assert (log.env_steps, log.episodes) == (6, 3)
-    log.append(origin(3), 4, bytes(100))
+    log.append(Parcel.of(origin(3), bytes(100)), 4)
     log.close()
     _, records = opened(tmp_path)
     assert [r.origin.seq for r in records] == [0, 1, 2, 3]
@@ -368,12 +370,12 @@ def test_append_that_fails_for_want_of_space_leaves_no_trace(tmp_path):
 
 def test_rotation_that_fails_for_want_of_space_is_made_up_for(tmp_path):
     log, _ = opened(tmp_path, capacity=5, segment_bytes=1)
-    log.append(origin(0), 4, b"first")
+    log.append(Parcel.of(origin(0), b"first"), 4)
     with largest_file(4):
         for _ in range(2):
             with pytest.raises(OSError):
-                log.append(origin(1), 4, b"second")
-    log.append(origin(1), 4, b"second")
+                log.append(Parcel.of(origin(1), b"second"), 4)
+    log.append(Parcel.of(origin(1), b"second"), 4)
     log.close()
     _, records = opened(tmp_path)
     assert [r.payload for r in records] == [b"first", b"second"]
@@ -383,21 +385,32 @@ def test_rotation_that_fails_for_want_of_space_is_made_up_for(tmp_path):
 def test_failed_append_after_a_torn_tail_leaves_no_hole(tmp_path):
     segment = filled(tmp_path)
     size = segment.stat().st_size
-    segment.write_bytes(segment.read_bytes() + b"NVQ1torn" * 20)
+    segment.write_bytes(segment.read_bytes() + b"NVQ2torn" * 20)
     log, _ = opened(tmp_path)
     with largest_file(size + 10), pytest.raises(OSError):
-        log.append(origin(3), 4, b"late")
+        log.append(Parcel.of(origin(3), b"late"), 4)
     assert segment.stat().st_size == size
-    log.append(origin(3), 4, b"late")
+    log.append(Parcel.of(origin(3), b"late"), 4)
     _, records = opened(tmp_path)
     assert [r.payload for r in records][-1] == b"late"
 
 
-def test_checksum_is_of_the_body(tmp_path):
+def test_checksums_are_of_the_counts_and_the_payload(tmp_path):
     data = filled(tmp_path, 1).read_bytes()
-    assert data[:4] == b"NVQ1"
-    assert int.from_bytes(data[4:8], "little") == len(data) - 12
-    assert int.from_bytes(data[8:12], "little") == zlib.crc32(data[12:])
+    assert data[:4] == b"NVQ2"
+    size, crc, payload_size, payload_crc = struct.unpack_from("<4I", data, 4)
+    assert 20 + size + payload_size == len(data)
+    assert crc == zlib.crc32(data[20 : 20 + size])
+    assert payload_crc == zlib.crc32(data[20 + size :])
+
+
+def test_log_of_an_earlier_version_is_refused_and_left_alone(tmp_path):
+    segment = filled(tmp_path)
+    earlier = segment.read_bytes().replace(b"NVQ2", b"NVQ1")
+    segment.write_bytes(earlier)
+    with pytest.raises(UsageError, match="earlier version"):
+        opened(tmp_path)
+    assert segment.read_bytes() == earlier
 
 
 def synced(folder: Path, segment_bytes: int = 2**20) -> EpisodeLog:
@@ -414,7 +427,7 @@ def test_one_commit_brings_many_appends_to_the_disk_with_one_wait(tmp_path, sync
     for group in (range(0, 50), range(50, 51), range(51, 60)):
         syncs.calls.clear()
         for seq in group:
-            log.append(origin(seq), 1, bytes(100))
+            log.append(Parcel.of(origin(seq), bytes(100)), 1)
         assert syncs.calls == [], "an append does not wait"
         log.commit()
         # of the right file, when all of it was written
@@ -428,7 +441,7 @@ def test_one_commit_brings_many_appends_to_the_disk_with_one_wait(tmp_path, sync
 def test_a_segment_is_on_the_disk_before_the_next_one_begins(tmp_path, syncs):
     log = synced(tmp_path, segment_bytes=300)
     for seq in range(6):  # two episodes fill a segment
-        log.append(origin(seq), 1, bytes(150))
+        log.append(Parcel.of(origin(seq), bytes(150)), 1)
     sizes = {path.name: path.stat().st_size for path in sorted(tmp_path.glob("*.log"))}
     assert list(sizes) == ["00000001.log", "00000002.log", "00000003.log"]
     assert syncs.calls == [(name, sizes[name]) for name in ("00000001.log", "00000002.log")]
@@ -439,7 +452,7 @@ def test_a_segment_is_on_the_disk_before_the_next_one_begins(tmp_path, syncs):
 def test_without_sync_no_episode_waits_for_the_disk(tmp_path, syncs):
     log, _ = opened(tmp_path, segment_bytes=300)
     for seq in range(6):
-        log.append(origin(seq), 1, bytes(150))
+        log.append(Parcel.of(origin(seq), bytes(150)), 1)
         log.commit()
     log.close()
     assert syncs.calls == []
@@ -455,13 +468,13 @@ def test_names_of_new_segments_are_brought_to_the_disk_with_sync(tmp_path, monke
     monkeypatch.setattr(os, "fsync", fsync)
     log = synced(tmp_path, segment_bytes=300)
     for seq in range(6):
-        log.append(origin(seq), 1, bytes(150))
+        log.append(Parcel.of(origin(seq), bytes(150)), 1)
     assert folders.count(tmp_path.resolve()) >= 3
 
 
 def test_commit_that_failed_never_says_later_that_all_is_well(tmp_path, syncs):
     log = synced(tmp_path)
-    log.append(origin(0), 1, b"lost")
+    log.append(Parcel.of(origin(0), b"lost"), 1)
     syncs.fail = 1
     with pytest.raises(OSError, match="Input/output"):
         log.commit()
@@ -469,16 +482,16 @@ def test_commit_that_failed_never_says_later_that_all_is_well(tmp_path, syncs):
     with pytest.raises(OSError):
         log.commit()
     with pytest.raises(OSError):
-        log.append(origin(1), 1, b"new")
+        log.append(Parcel.of(origin(1), b"new"), 1)
         log.commit()
 
 
 def test_rotation_whose_wait_for_the_disk_fails_makes_every_later_commit_fail(tmp_path, syncs):
     log = synced(tmp_path, segment_bytes=1)
-    log.append(origin(0), 1, b"lost")
+    log.append(Parcel.of(origin(0), b"lost"), 1)
     syncs.fail = 1
     with pytest.raises(OSError, match="Input/output"):
-        log.append(origin(1), 1, b"next segment")
+        log.append(Parcel.of(origin(1), b"next segment"), 1)
     with pytest.raises(OSError):  # it would acknowledge what the disk has lost
         log.commit()
 
@@ -496,7 +509,7 @@ def test_duplicates_that_a_rotation_writes_down_are_on_the_disk_before(tmp_path,
 
     syncs.before = lose_power
     for seq in range(4):
-        log.append(origin(seq), 1, b"episode")
+        log.append(Parcel.of(origin(seq), b"episode"), 1)
     log.close()
     assert len(copies) == 3
     for seq, copy in enumerate(copies):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from common.config import Config
+from common.delivery import Parcel
 from common.errors import UsageError
 from common.frames import Film
 from common.messages import Frames, MessageError, Origin, decode, encode
@@ -56,7 +57,7 @@ def add(store: FrameStore, index: int, boot: str = "b1") -> bool:
     message = drive(index)
     if store.seen(origin(index, boot)):
         return False
-    store.add(origin(index, boot), message, encode(message))
+    store.add(Parcel.of(origin(index, boot), encode(message)), message)
     assert store.seen(origin(index, boot))
     return True
 
@@ -122,7 +123,7 @@ def test_all_frames_of_a_drive_are_on_one_side_and_one_drive_in_ten_is_held_out(
     seeds = np.random.default_rng(0).permutation(200)
     for index, seed in enumerate(seeds.tolist()):
         message = drive(index, seed)
-        store.add(origin(index), message, encode(message))
+        store.add(Parcel.of(origin(index), encode(message)), message)
     table, held = store.load()
     for start in np.unique(table.start):
         assert len(set(held[table.start == start].tolist())) == 1
@@ -429,7 +430,7 @@ def test_drive_that_does_not_fit_leaves_no_trace(tmp_path, change, reason):
     message = drive(0, **change)
     before = content(tmp_path)
     with pytest.raises(MessageError, match=reason):
-        store.add(origin(0), message, encode(message))
+        store.add(Parcel.of(origin(0), encode(message)), message)
     assert content(tmp_path) == before
     assert (store.sequences, store.drives) == (0, 0)
     assert add(store, 0)

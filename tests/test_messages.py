@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from common import messages as m
 from common.config import Config, resolve
-from common.messages import MessageError, decode, encode
+from common.messages import MessageError, _to_array, decode, encode
 from common.observation import ObservationLayout
 from common.tasks import (
     FIRST_SUITE_SEED,
@@ -570,3 +570,13 @@ def test_deep_nesting_is_refused():
     for depth in (100, 500, 5000):
         with pytest.raises(MessageError):
             decode(m.TaskQuery, b"\x93\x01\xa9TaskQuery" + b"\x91" * depth + b"\xc0")
+
+
+def test_every_float16_that_is_nan_or_infinite_is_refused_and_no_other():
+    for start in range(0, 65536, 256):
+        values = np.arange(start, start + 256, dtype=np.uint16).view(np.float16)
+        for value in values[~np.isfinite(values)]:
+            with pytest.raises(ValueError, match="NaN"):
+                _to_array(["float16", [2], np.array([0, value], np.float16).tobytes()])
+        finite = values[np.isfinite(values)]
+        assert len(_to_array(["float16", [len(finite)], finite.tobytes()])) == len(finite)

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import threading
 import time
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -28,6 +27,7 @@ from typing import Any
 
 import numpy as np
 import zenoh
+from isal.isal_zlib import crc32
 
 from common.access import LOCAL
 from common.bus import Member, ask_bytes, ask_later
@@ -230,7 +230,7 @@ class _Ways:
 
     def acknowledged(self, durability: str, episode: Episode, payload: bytes, n: int) -> None:
         """As a Sender does, but from memory."""
-        crc, key = zlib.crc32(payload), f"{channel(durability)}/{MEMBER.address}"
+        crc, key = crc32(payload), f"{channel(durability)}/{MEMBER.address}"
 
         def send(answer: Answer) -> None:
             origin = Origin(actor=MEMBER.address, boot="memory", seq=next(self._numbers[durability]))
@@ -427,11 +427,12 @@ def _ingest(
 ) -> Callable[[], tuple[float, float]]:
     """Measures what an episode costs a learner besides the bus: seconds, and seconds of CPU."""
     learner, log = Learner(config), EpisodeLog(folder, config.replay.capacity)
-    take, numbers = make_take(config, ours, log), count()
+    take, numbers, crc = make_take(config, ours, log), count(), crc32(payload)
 
     def work() -> None:
         for _ in range(INGESTED):
-            episode = take(Origin(actor=MEMBER.address, boot="limit", seq=next(numbers)), payload)
+            origin = Origin(actor=MEMBER.address, boot="limit", seq=next(numbers))
+            episode = take(Parcel(origin, crc, payload))
             log.commit()
             learner.insert(episode, log.env_steps - episode.length)
 

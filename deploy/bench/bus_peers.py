@@ -20,9 +20,9 @@ from common.access import LOCAL
 from common.bus import Keys, Member
 from common.config import Config, parse
 from common.contract import check_digest, digest
-from common.delivery import Receiver, Sender, Spool
+from common.delivery import Parcel, Receiver, Sender, Spool
 from common.link import make_link, open_client, open_hub
-from common.messages import Episode, Origin, decode
+from common.messages import Episode, decode
 from common.observation import ObservationLayout
 from common.telemetry import Quantiles
 from deploy.launcher import free_port
@@ -36,7 +36,7 @@ SPOOLED = 4
 """Episodes that an actor may have waiting."""
 PATIENCE = 60.0
 """Seconds after which something is broken."""
-Take = Callable[[Origin, bytes], Episode]
+Take = Callable[[Parcel], Episode]
 
 
 def channel(name: str) -> str:
@@ -48,11 +48,11 @@ def make_take(config: Config, ours: dict[str, str], log: EpisodeLog) -> Take:
     """What a learner does with an episode before it acknowledges it, up to the limiter and its own queue."""
     layout, world = ObservationLayout.of(config), config.world
 
-    def take(origin: Origin, payload: bytes) -> Episode:
-        episode = decode(Episode, payload)
+    def take(parcel: Parcel) -> Episode:
+        episode = decode(Episode, parcel.payload)
         check_digest(ours, episode.digest)
         episode.check_layout(layout, world.max_episode_steps, world.reward.largest)
-        log.append(origin, episode.length, payload)
+        log.append(parcel, episode.length)
         return episode
 
     return take
@@ -65,12 +65,12 @@ def receive(folder: Path, endpoint: str) -> None:
     with open_hub(make_link(endpoint)) as session, _zmq_router() as zmq_port:
         servers: list[Any] = []
         for durability in DURABILITIES:
-            log = EpisodeLog(folder / durability, config.replay.capacity, sync=durability == "host")
-            take: Callable[[Origin, bytes], Any] = make_take(config, ours, log)
+            sync = durability == "host"
+            log = EpisodeLog(folder / durability, config.replay.capacity, sync=sync)
+            take: Callable[[Parcel], Any] = make_take(config, ours, log)
+            commit = log.commit if sync else None
             servers.append(
-                Receiver(
-                    session, channel(durability), take, log.seen.seen, Episode.max_bytes, commit=log.commit
-                )
+                Receiver(session, channel(durability), take, log.seen.seen, Episode.max_bytes, commit=commit)
             )
         servers += _bare(session)
         _say({"zmq": zmq_port})

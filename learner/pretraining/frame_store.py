@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Config, differing_keys
+from common.delivery import Parcel
 from common.errors import UsageError
 from common.files import write_atomically
 from common.frames import Film, FrameTable
@@ -70,14 +71,14 @@ class FrameStore:
         """Whether a drive is here already."""
         return self._log.seen.seen(origin)
 
-    def add(self, origin: Origin, message: Frames, payload: bytes) -> None:
+    def add(self, parcel: Parcel, message: Frames) -> None:
         """Writes a drive that was not seen before, on record when this returns.
 
         Raises MessageError when it does not fit, and OSError when it cannot be written.
         """
         most = self.config.pretraining.drive_steps + 1
         message.check_layout(self.config.world.camera.size, most)
-        self._log.append(origin, len(message.frame), payload)
+        self._log.append(parcel, len(message.frame))
         self._count(len(message.frame))
 
     def seal(self) -> None:

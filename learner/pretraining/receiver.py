@@ -6,8 +6,8 @@ import zenoh
 
 from common.bus import BUSY, Keys, serve
 from common.contract import check_digest, digest
-from common.delivery import Receiver
-from common.messages import ContractReply, Frames, Message, MessageError, Nothing, Origin, decode
+from common.delivery import Parcel, Receiver
+from common.messages import ContractReply, Frames, Message, MessageError, Nothing, decode
 from learner.pretraining.frame_store import FrameStore
 
 
@@ -27,11 +27,11 @@ class FrameReceiver:
             serve(session, keys.contract, Nothing, self._answer_contract),
         ]
 
-    def _take(self, origin: Origin, payload: bytes) -> None:
-        message = decode(Frames, payload)
+    def _take(self, parcel: Parcel) -> None:
+        message = decode(Frames, parcel.payload)
         check_digest(self.contract.digest, message.digest)
         try:
-            self._store.add(origin, message, payload)
+            self._store.add(parcel, message)
         except OSError as error:
             self.failure = error
             raise MessageError(BUSY) from None  # the sender keeps it, should there be a next time
