@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 
 STOP_SECONDS = 4.0
 LONGEST_BACK_OFF = 30.0
 
 
+FREE_PORTS = range(15_000, 32_000)
+"""Below those that a system gives to connections, which may take one before its process listens."""
+
+
 def free_port() -> int:
     """A TCP port on loopback that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    for port in random.SystemRandom().choices(FREE_PORTS, k=100):
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise RunError(f"of a hundred ports from {FREE_PORTS[0]} to {FREE_PORTS[-1]} none is free")
 
 
 @dataclass
