@@ -71,6 +71,7 @@ class ActorService:
         self._episodes = Sender(session, Spool(spool / "learner", limit), member, boot)
         self._reports = Sender(session, Spool(spool / "curriculum", limit / 8), member, boot, timeout=5.0)
         self._proposals: list[Proposal | None] = [None] * len(self._rollout)
+        self._tasks: list[Task | None] = [None] * len(self._rollout)
         self._first_version = [Version()] * len(self._rollout)
         self._agent_steps = [0] * len(self._rollout)
         self._answers: queue.SimpleQueue[tuple[int, float, bytes | Exception]] = queue.SimpleQueue()
@@ -135,8 +136,10 @@ class ActorService:
             proposal = _proposal(answer, self._cells[slot])
             if proposal is not None:
                 self._task_latency.add(waited_ms)
-            task = proposal.task if proposal else random_task(self._cells[slot], self.config, self._rng)
-            self._proposals[slot] = proposal
+            task = random_task(self._cells[slot], self.config, self._rng)
+            if proposal is not None and isinstance(proposal.task, Task):
+                task = proposal.task
+            self._proposals[slot], self._tasks[slot] = proposal, task
             self._categories[proposal.category if proposal else "unserved"] += 1
             self._actor.refresh(slot)
             self._first_version[slot] = self._actor.version(slot)
@@ -164,15 +167,12 @@ class ActorService:
             self.contract.digest, self._first_version[slot], self._actor.version(slot), category
         )
         self._episodes.put(self.keys.trajectory, episode)
-        if proposal is not None and not self._reports.spool.full:
+        if not self._reports.spool.full:
             outcome = Outcome(
                 digest=self.contract.digest,
-                proposal=proposal.id,
-                task=proposal.task,
-                properties=proposal.properties,
-                q=proposal.q,
+                proposal=proposal.id if proposal else None,
+                task=self._tasks[slot],
                 success=finished.ending == "success",
-                category=category,
             )
             self._reports.put(self.keys.result, outcome)
         if proposal is not None and proposal.f is not None:
@@ -181,7 +181,7 @@ class ActorService:
 
     def _look(self, slot: int) -> None:
         """Adds one more candidate start to the next batch for the curriculum's task database."""
-        if self.config.curriculum.algorithm == "rnd":
+        if not self.config.curriculum.uses_q:
             return
         task: Task = candidate_task(self._cells[slot], self.config, self._rng)
         self._candidates.append(self._rollout.look(slot, task))
@@ -236,4 +236,6 @@ def _proposal(answer: bytes | Exception, cell: int) -> Proposal | None:
     except (NoAnswerError, RefusedError, MessageError) as error:
         log.info("no task: %s", error)
         return None
-    return tasks[0] if tasks and tasks[0].task.cell == cell else None
+    if not tasks or not isinstance(tasks[0].task, Task) or tasks[0].task.cell != cell:
+        return None
+    return tasks[0]

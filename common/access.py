@@ -167,6 +167,7 @@ def _member(role: str, group: str) -> dict[str, tuple[str, ...]]:
 ALL = ("**",)
 BETWEEN_HUBS = Rights(asks=ALL, serves=ALL, tells=ALL, hears=ALL, lives=ALL, watches=ALL)
 """Each hub holds its own clients to the rules; from hub to hub everything passes."""
+QUESTIONS = ("curriculum/task", "curriculum/score", "curriculum/snapshot")
 ROLES = {
     "curriculum": Rights(
         asks=("contract", "weights/latest/critic"),
@@ -176,7 +177,7 @@ ROLES = {
         **_member("curriculum", "curriculum"),
     ),
     "operator": Rights(
-        asks=("contract", "curriculum/task"), hears=("stat/**", "weights/version"), watches=("live/**",)
+        asks=("contract", *QUESTIONS), hears=("stat/**", "weights/version"), watches=("live/**",)
     ),
     "learner": BETWEEN_HUBS,
     "router": BETWEEN_HUBS,
@@ -190,7 +191,7 @@ def actor_rights(group: str) -> Rights:
         asks=(
             "contract",
             "weights/latest/policy",
-            "curriculum/task",
+            *QUESTIONS,
             *(f"{channel}/{group}/*" for channel in delivered),
         ),
         hears=("weights/version",),

@@ -69,6 +69,8 @@ class Keys:
         self.contract = f"{self.root}/contract"
         self.version = f"{self.root}/weights/version"
         self.task = f"{self.root}/curriculum/task"
+        self.score = f"{self.root}/curriculum/score"
+        self.snapshot = f"{self.root}/curriculum/snapshot"
         self.result = f"{self.root}/curriculum/result"
         self.candidates = f"{self.root}/curriculum/candidates"
 

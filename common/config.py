@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tomli_w
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from common.errors import UsageError
 from common.settings import Count, Fraction, NotNegative, Positive, Section
 from common.world_config import StartRanges, WorldConfig
 
 Preset = Literal["paper", "fast", "smoke"]
-Variant = Literal["navacl-q", "rnd", "e2e"]
+Variant = Literal["navacl-q", "navacl-q-letter", "navacl", "q-only", "schedule", "sfl", "rnd", "e2e"]
 Objective = Literal["reconstruction", "semantic"]
 
 
@@ -195,10 +195,73 @@ class GateConfig(Section):
     ranges: FavourableRanges = FavourableRanges()
 
 
-class CurriculumConfig(Section):
-    """NavACL-Q (algorithm 1, table of hyper-parameters) and its extension NavACL-Q+."""
+class ScheduleConfig(Section):
+    """The plain schedule: ranges widen from the gate's to the full ones with the success of their tasks."""
 
-    algorithm: Literal["navacl-q", "navacl-q+", "rnd"] = "navacl-q+"
+    first_level: Fraction = 0.15
+    step: Fraction = 0.06
+    """By which the level grows when enough of the last tasks succeeded."""
+    window: Count = 50
+    threshold: Fraction = 0.65
+
+
+class SflConfig(Section):
+    """Sampling for learnability (Rutherford et al., NeurIPS 2024), for each cell."""
+
+    levels: Count = 24
+    """Random tasks that are surveyed."""
+    trials: Count = 3
+    """Episodes of each in a survey."""
+    kept: Count = 8
+    """Tasks of highest p (1 - p) that are kept."""
+    share: Fraction = 0.5
+    """Share of the tasks between two surveys that are taken from the kept ones; the others are random."""
+    pause: Count = 100
+    """Tasks between two surveys."""
+
+
+class ParameterConfig(Section):
+    """A number that makes up a task of somebody else's environment."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
+    low: float
+    high: float
+    easy: float
+    """Its easiest value, from which gate and narrowed ranges start."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ParameterConfig:
+        if not self.low <= self.easy <= self.high or self.low == self.high:
+            raise ValueError(f"{self.name}: low <= easy <= high and low < high must hold")
+        return self
+
+
+GEOMETRIC = (
+    "distance",
+    "agent_clearance",
+    "goal_clearance",
+    "relative_angle",
+    "lateral_offset",
+    "approach_angle",
+)
+"""Properties of a docking task, the paper's four (table 2) first; see common/tasks.py."""
+INPUTS = (*GEOMETRIC, "q")
+"""What f_pi may see of a docking task."""
+
+
+class CurriculumConfig(Section):
+    """NavACL-Q (algorithm 1, table of hyper-parameters), its extension NavACL-Q+, and their rivals."""
+
+    algorithm: Literal["navacl-q", "navacl-q+", "rnd", "schedule", "sfl"] = "navacl-q+"
+    """`navacl-q+`: frontier at predicted success 0.5, f_pi fitted from a reservoir."""
+    inputs: Annotated[tuple[str, ...], Field(min_length=1)] = INPUTS
+    """Of f_pi. Without q it is NavACL, with q alone the domain-independent variant (section 5.3)."""
+    balanced: bool = False
+    """`navacl-q+`: successes and failures are drawn equally often from the reservoir."""
+    calibrate: bool = False
+    """Predictions are corrected by what became of the last ones (Platt scaling)."""
+    calibration_window: Count = 300
+    """Outcomes whose predictions are corrected by."""
     beta: Annotated[float, Field(ge=0)] = 1.0
     gamma: Annotated[float, Field(ge=0)] = 0.1
     chi: Fraction = 0.95
@@ -223,7 +286,37 @@ class CurriculumConfig(Section):
     narrowed_candidates: Fraction = 0.75
     """Share of candidates drawn from ranges between the gate's and the full ones."""
     store_per_cell: Count = 1000
+    lease: Positive = 600.0
+    """Seconds after which a task that was handed out and not reported may be proposed again."""
     gate: GateConfig = GateConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    sfl: SflConfig = SflConfig()
+    parameters: Annotated[tuple[ParameterConfig, ...], Field(max_length=32)] = ()
+    """Of somebody else's environment, whose tasks are boxes of numbers; empty: the docking world's tasks."""
+
+    @field_validator("inputs")
+    @classmethod
+    def _known(cls, inputs: tuple[str, ...]) -> tuple[str, ...]:
+        for name in inputs:
+            if name not in INPUTS:
+                raise ValueError(f"{name!r} is none of {', '.join(INPUTS)}")
+        if len(set(inputs)) < len(inputs):
+            raise ValueError("each only once")
+        return inputs
+
+    @field_validator("parameters")
+    @classmethod
+    def _named(cls, parameters: tuple[ParameterConfig, ...]) -> tuple[ParameterConfig, ...]:
+        names = [p.name for p in parameters]
+        for name in names:
+            if name in ("q", "cell") or names.count(name) > 1:
+                raise ValueError(f"{name!r} is the name of something else")
+        return parameters
+
+    @property
+    def uses_q(self) -> bool:
+        """Whether tasks are judged by Q(s0, a0), for which actors encode candidate starts."""
+        return self.algorithm.startswith("navacl") and "q" in self.inputs and not self.parameters
 
 
 class Config(Section):
@@ -251,6 +344,21 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "navacl-q": {},
     "rnd": {"curriculum": {"algorithm": "rnd", "gate": {"enabled": False}}},
     "e2e": {"encoder": {"end_to_end": True, "weights": "random"}},
+    "navacl-q-letter": {
+        "curriculum": {
+            "algorithm": "navacl-q",
+            "inputs": [*GEOMETRIC[:4], "q"],
+            "learning_rate": 4e-4,
+            "fit_steps": 1,
+            "easy_share": 0.5,
+            "narrowed_candidates": 0.0,
+            "gate": {"enabled": False},
+        }
+    },
+    "navacl": {"curriculum": {"inputs": list(GEOMETRIC[:4])}},
+    "q-only": {"curriculum": {"inputs": ["q"]}},
+    "schedule": {"curriculum": {"algorithm": "schedule", "gate": {"enabled": False}}},
+    "sfl": {"curriculum": {"algorithm": "sfl", "gate": {"enabled": False}}},
 }
 
 

@@ -384,12 +384,14 @@ class DuplicateFilter:
 
     def add(self, origin: Origin) -> None:
         """Remembers a message, for which `seen` was asked before."""
+        self.restore([self.after(origin)])
+
+    def after(self, origin: Origin) -> list[object]:
+        """What will be known of the sender of a message once that is added: an element of `state`."""
         key = origin.actor, origin.boot
         high = self._next.get(key, max(0, origin.seq - MAX_GAP))
-        self._gaps[key].discard(origin.seq)
-        if origin.seq >= high:
-            self._gaps[key].update(range(high, origin.seq))
-            self._next[key] = origin.seq + 1
+        gaps = self._gaps[key] | set(range(high, origin.seq))
+        return [*key, max(high, origin.seq + 1), sorted(gaps - {origin.seq})]
 
     def state(self) -> list[list[object]]:
         """What `restore` takes, in plain lists."""

@@ -12,15 +12,24 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainSerializer,
+    Tag,
+    ValidationError,
+)
 
 from common.cells import CELLS
 from common.observation import ACTION_SIZE, Columns, ObservationLayout
-from common.tasks import GeometricProperties, TrainingTask
+from common.tasks import TrainingTask
 
 SCHEMA_VERSION = 1
 """Of the encoded messages, those in logs too."""
-PROTOCOL = 2
+PROTOCOL = 3
 """Of the bus: its keys, and how messages are delivered."""
 MEGABYTE = 2**20
 BUNDLE = 64
@@ -29,7 +38,7 @@ BUNDLE = 64
 Ending = Literal["success", "dolly_contact", "other_contact", "timeout"]
 ENDINGS: tuple[Ending, ...] = ("success", "dolly_contact", "other_contact", "timeout")
 Requested = Literal["easy", "frontier", "random"]
-Category = Literal["easy", "frontier", "random", "gate", "rnd", "unserved"]
+Category = Literal["easy", "frontier", "random", "gate", "rnd", "schedule", "sfl", "unserved"]
 """Why a task was proposed: what was requested, `random` too when n_T draws met nothing, `gate` while the gate
 is closed, `rnd` without curriculum; `unserved` when the curriculum did not answer."""
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
@@ -37,6 +46,8 @@ CellIndex = Annotated[int, Field(ge=0, lt=len(CELLS))]
 Address = Annotated[str, Field(max_length=129, pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64})?$")]
 """GROUP/NAME of a process; the group is the common name of its certificate, or `local`."""
 NonNegative = Annotated[int, Field(ge=0)]
+Pose = tuple[float, float, float]
+"""x and y, m; yaw, rad."""
 
 
 class MessageError(ValueError):
@@ -203,39 +214,106 @@ class TaskQuery(Message):
     count: Annotated[int, Field(ge=1, le=1000)] = 1
 
 
+Parameters = Annotated[dict[Name, float], Field(min_length=1, max_length=32)]
+"""A task of somebody else's environment."""
+
+
+def _kind_of_task(task: Any) -> str:
+    return "other task" if isinstance(task, dict) and "cell" not in task else "docking task"
+
+
+AnyTask = Annotated[
+    Annotated[TrainingTask, Tag("docking task")] | Annotated[Parameters, Tag("other task")],
+    Discriminator(_kind_of_task),
+]
+Properties = Annotated[dict[Name, float], Field(max_length=32)]
+"""What f_pi may see of a task, by name; m and rad in the docking world."""
+
+
 class Proposal(Message):
     """One proposed task with everything that led to it."""
 
     id: Name
-    task: TrainingTask
+    task: AnyTask
     requested: Requested
     category: Category
-    properties: GeometricProperties
+    why: str
+    """The choice in words."""
+    properties: Properties
     q: float | None
+    """Q(s0, a0) under the weights `q_version`, EPOCH.COUNTER; `q_reason` says where it is from, or not."""
+    q_version: str | None
     q_reason: str
     f: float | None
+    """Predicted success; mu and sigma are the normal fit to those of the tasks drawn beside it."""
     mu: float | None
     sigma: float | None
-    robot: tuple[float, float, float]
-    dolly: tuple[float, float, float]
+    robot: Pose | None
+    dolly: Pose | None
 
 
 class Proposals(Message):
     """The answer to a TaskQuery."""
 
+    max_bytes: ClassVar[int] = 16 * MEGABYTE
+
     tasks: list[Proposal]
 
 
 class Outcome(Message):
-    """How a proposed task ended, for f_pi; `proposal` makes it idempotent."""
+    """How a task ended, for f_pi; `proposal` makes it idempotent, None: it came from no curriculum."""
 
-    digest: Digest
-    proposal: Name
-    task: TrainingTask
-    properties: GeometricProperties
-    q: float | None
+    digest: Digest = {}
+    proposal: Name | None
+    task: AnyTask
     success: bool
-    category: Category
+
+
+class Scored(Message):
+    """A task to be scored: itself, or its properties, all that f_pi sees."""
+
+    task: AnyTask | None = None
+    properties: Properties | None = None
+    q: float | None = None
+    """Q(s0, a0), when whoever asks knows it."""
+
+
+class ScoreQuery(Message):
+    """What is the predicted success of these tasks?"""
+
+    tasks: Annotated[list[Scored], Field(min_length=1, max_length=1000)]
+
+
+class Scores(Message):
+    """The answer to a ScoreQuery, task by task."""
+
+    max_bytes: ClassVar[int] = 16 * MEGABYTE
+
+    f: list[float]
+    properties: list[Properties]
+    outcomes: NonNegative
+    """From how many outcomes f_pi has learned."""
+
+
+class Snapshot(Message):
+    """The state of a curriculum."""
+
+    algorithm: str
+    outcomes: NonNegative
+    candidates: list[NonNegative]
+    """In the database, by cell."""
+    leases: NonNegative
+    gate_open: bool
+    proposed: dict[str, NonNegative]
+    """Tasks by category."""
+    inputs: list[str]
+    """Of f_pi; empty when there is none."""
+    brier: float | None
+    """Mean squared error of the predictions made before each of the last outcomes."""
+    reliability: list[tuple[float, float, NonNegative]]
+    """The same by tenths of the prediction: mean prediction, share of successes, outcomes."""
+    network: bytes
+    """f_pi and its scaling, safetensors; empty when there is none."""
 
 
 class Candidate(Message):
@@ -337,7 +415,8 @@ def decode(kind: type[M], data: bytes) -> M:
         return kind.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        path = ".".join(str(part) for part in first["loc"])[:80]
+        # pydantic names also what the field was tried as: "docking task", "function-after[...]"
+        path = ".".join(str(part) for part in first["loc"] if not {" ", "["} & set(str(part)))[:80]
         raise MessageError(f"{name}.{path}: {first['msg'][:160]}") from None
 
 

@@ -1,24 +1,48 @@
-"""The curriculum's state: what to propose, given the outcomes and candidates so far. Free of the bus."""
+"""The curriculum: gate, algorithm, task database and critic behind a few methods. Free of the bus."""
 
 from __future__ import annotations
 
-import json
+import logging
+import sqlite3
+import time
 import uuid
-from collections import Counter, deque
-from pathlib import Path
+from collections import Counter, OrderedDict, deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import chain
 
 import numpy as np
+import safetensors.torch
 
 from common.config import Config
-from common.delivery import DuplicateFilter
 from common.errors import UsageError
-from common.messages import Candidates, Category, Outcome, Proposal, Requested
-from common.policy_files import finish_saving, load_tensors, save_folder
-from common.tasks import Task, candidate_task, random_task
-from common.world_config import StartRanges
-from curriculum.adaptive_filtering import fit_normal, get_anchored_task, get_dynamic_task, get_task_type
-from curriculum.success_network import SuccessNetwork
-from curriculum.task_store import CriticView, Entry, TaskStore
+from common.messages import (
+    Candidates,
+    MessageError,
+    Origin,
+    Outcome,
+    Proposal,
+    Scored,
+    ScoreQuery,
+    Scores,
+    Snapshot,
+)
+from curriculum.algorithms import make_algorithm
+from curriculum.algorithms.base import Pick, Result, State
+from curriculum.algorithms.navacl_q import NavaclQ
+from curriculum.calibration import brier_score, reliability
+from curriculum.critic import CriticView
+from curriculum.database import Database
+from curriculum.task_space import Entry, make_space
+
+log = logging.getLogger(__name__)
+STATE = "curriculum"
+HISTORY = 200
+"""Outcomes after which f_pi is kept for the pictures."""
+DAMAGE = sqlite3.DatabaseError, safetensors.SafetensorError, LookupError, ValueError, TypeError
+"""What reading a database may raise that is not of this run, or not whole."""
+JUDGED = 1000
+"""Outcomes over which the predictions made before them are judged."""
 
 
 class Gate:
@@ -26,7 +50,6 @@ class Gate:
 
     def __init__(self, config: Config) -> None:
         self.config = config.curriculum.gate
-        self.ranges = StartRanges(**self.config.ranges.model_dump())
         self.open = not self.config.enabled
         self.outcomes: deque[bool] = deque(maxlen=self.config.window)
 
@@ -37,137 +60,289 @@ class Gate:
             self.open = self.open or sum(self.outcomes) >= self.config.threshold * self.config.window
 
 
-class Curriculum:
-    """Gate, f_pi, task database and critic behind `propose`, `report`, `add`, `save`, `restore`."""
+class _Cell:
+    """The tasks of a cell, for an algorithm: candidates that nobody has in hand, oldest first."""
 
-    def __init__(self, config: Config) -> None:
-        self.config = config
-        self.rng = np.random.default_rng([config.seed, 3])
-        self.network = SuccessNetwork(config.curriculum, config.seed)
-        self.store = TaskStore(config)
+    def __init__(self, curriculum: Curriculum, cell: int) -> None:
+        self.cell, self._owner = cell, curriculum
+        self.entries: OrderedDict[int, Entry] = OrderedDict()
+
+    def draw(self, count: int) -> list[Entry]:
+        owner, now = self._owner, time.time()
+        free = [entry for entry in self.entries.values() if entry.lease <= now]
+        valued = [entry for entry in free if entry.q is not None]
+        free = valued or free  # f_pi does not compare with Q and without
+        if free:
+            return [free[int(i)] for i in owner.rng.permutation(len(free))[:count]]
+        share = owner.config.curriculum.narrowed_candidates
+        return [owner.space.candidate(self.cell, share, owner.rng) for _ in range(count)]
+
+    def new(self, level: float = 1.0) -> Entry:
+        return self._owner.space.draw(self.cell, level, self._owner.rng)
+
+
+class Curriculum:
+    """What a database holds, and what to propose from it; `encoder` is that of the candidates in it.
+
+    What changes it is in the database before it is learned: after an OSError nothing has happened. One thread
+    at a time.
+    """
+
+    def __init__(self, config: Config, database: Database | None = None, encoder: str = "") -> None:
+        self.config, self.encoder = config, encoder
+        self.database = database or Database(None)
+        self.space = make_space(config)
         self.critic = CriticView(config)
-        self.gate = Gate(config)
+        self._load()
+        with suppress(OSError), self._writing():
+            self.database.drop_candidates_but(encoder)
+
+    def _load(self) -> None:
+        """Everything from the database: a saved state, and what came after it."""
+        self.rng = np.random.default_rng([self.config.seed, 3])
+        self.algorithm = make_algorithm(self.config, self.space)
+        self.gate = Gate(self.config)
         self.proposed: Counter[str] = Counter()
-        self.outcomes = 0
-        self.seen = DuplicateFilter()
+        self.outcomes = self.history = 0
+        self.judged: deque[tuple[float, bool]] = deque(maxlen=JUDGED)
+        self.cells = [_Cell(self, index) for index in range(self.space.cells)]
+        try:
+            self._load_tasks()
+            for outcome in self.database.outcomes(after=self._load_state()):
+                self._learn(outcome.result)
+        except DAMAGE as error:
+            raise UsageError(f"{self.database.name} does not fit: {error}; move it to start afresh") from None
+
+    def _load_tasks(self) -> None:
+        self.seen, leases = self.database.origins(), self.database.leases()
+        for entry in self.database.candidates(self.encoder):
+            assert entry.row is not None
+            entry.lease = leases.get(entry.row, 0.0)
+            self.cells[entry.cell].entries[entry.row] = entry
+
+    @property
+    def _kind(self) -> list[object]:
+        """What a saved state must agree with."""
+        settings = self.config.curriculum
+        scales = [list(scale) for scale in self.space.scales.values()]
+        return [settings.algorithm, list(self.space.inputs), list(settings.hidden), scales]
+
+    def _load_state(self) -> int:
+        """Takes a saved state; returns the number of the last outcome in it."""
+        found = self.database.load_state(STATE)
+        if found is None:
+            return 0
+        values, tensors = found
+        if values["kind"] != self._kind:
+            log.warning(
+                "another algorithm than before: it learns from the outcomes in %s", self.database.name
+            )
+            return 0
+        self.rng.bit_generator.state = values["rng"]
+        self.algorithm.restore(State(safetensors.torch.load(tensors), values["algorithm"]))
+        self.gate.open = self.gate.open or bool(values["gate_open"])
+        self.gate.outcomes.extend(values["gate_outcomes"])
+        self.proposed = Counter(values["proposed"])
+        self.judged.extend((float(f), bool(success)) for f, success in values["judged"])
+        self.outcomes = int(values["outcomes"])
+        self.history = self.outcomes - self.outcomes % HISTORY
+        return int(values["last"])
+
+    def save(self) -> None:
+        """Keeps the state."""
+        state = self.algorithm.snapshot()
+        values = {
+            "kind": self._kind,
+            "rng": self.rng.bit_generator.state,
+            "algorithm": dict(state.values),
+            "gate_open": self.gate.open,
+            "gate_outcomes": list(self.gate.outcomes),
+            "proposed": self.proposed,
+            "judged": list(self.judged),
+            "outcomes": self.outcomes,
+            "last": self.database.last_outcome(),
+        }
+        tensors = safetensors.torch.save(state.tensors)
+        with self._writing():
+            self.database.save_state(STATE, values, tensors)
+            self.database.drop_leases(before=time.time() - self.config.curriculum.lease)
+            if self.outcomes >= self.history + HISTORY:
+                about = {"kind": self._kind, "algorithm": dict(state.values)}
+                self.database.save_network(self.outcomes, about, tensors)
+                self.history = self.outcomes - self.outcomes % HISTORY
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """All of it lasts afterwards, or after an OSError nothing."""
+        try:
+            yield
+            self.database.commit()
+        except OSError:
+            self.database.roll_back()
+            raise
+
+    def __len__(self) -> int:
+        """Candidates in the database."""
+        return sum(len(cell.entries) for cell in self.cells)
 
     def propose(self, cell: int, t: int) -> Proposal:
-        """A task for a cell, asked at the agent's own step t (algorithm 2)."""
-        requested = get_task_type(t, self.config.curriculum, self.rng)
-        if self.config.curriculum.algorithm == "rnd":
-            return self._proposal(self._new(random_task(cell, self.config, self.rng)), "random", "rnd")
+        """A task for a cell, asked at the agent's own step t (algorithm 2); MessageError for no such cell."""
+        if cell >= len(self.cells):
+            raise MessageError(f"cell: {cell} does not exist here; 0 to {len(self.cells) - 1} do")
         if not self.gate.open:
-            task = random_task(cell, self.config, self.rng)
-            near = task.model_copy(update={"start": self.gate.ranges})
-            return self._proposal(self._new(near), requested, "gate")
-        return self._filter(cell, requested)
-
-    def report(self, outcome: Outcome) -> None:
-        """Takes the outcome of a proposed task."""
-        self.outcomes += 1
-        if outcome.category == "gate":
-            self.gate.add(outcome.success)
-        if self.config.curriculum.algorithm != "rnd":
-            self.network.add(outcome.properties, outcome.q, outcome.success)
-
-    def add(self, message: Candidates) -> None:
-        """Takes candidate starts into the database."""
-        self.store.add(message.candidates)
-
-    def _filter(self, cell: int, requested: Requested) -> Proposal:
-        """Adaptive filtering over candidates of the cell: fit, then draw until one meets the request."""
-        config = self.config.curriculum
-        sample = self._draw(cell, config.filter_samples)
-        mu, sigma = fit_normal(self._predict(sample))
-        # an empty database is made up for by geometry, too slow to do twice
-        draws = self._draw(cell, config.max_draws) if self.store.count(cell) else sample
-        f = self._predict(draws)
-        if self.network.plus:
-            found = get_anchored_task(requested, f, mu, sigma, config, self.rng)
+            done, of = sum(self.gate.outcomes), len(self.gate.outcomes)
+            why = f"favourable starts until they succeed: {done} of the last {of} did"
+            pick = Pick(self.cells[cell].new(0.0), "gate", why)
         else:
-            found = get_dynamic_task(requested, f.tolist(), mu, sigma, config)
-        category: Category = requested if found is not None else "random"
-        index = int(self.rng.integers(len(draws))) if found is None else found
-        self.store.remove(draws[index])
-        return self._proposal(draws[index], requested, category, float(f[index]), mu, sigma)
+            pick = self.algorithm.propose(t, self.cells[cell], self.rng)
+        self.proposed[pick.category] += 1
+        proposal = self._proposal(pick)
+        with suppress(OSError), self._writing():  # an outcome without a lease counts by its task
+            self.database.lease(proposal, pick, self.config.curriculum.lease)
+        return proposal
 
-    def _draw(self, cell: int, count: int) -> list[Entry]:
-        """RandomTask, `count` times: from the cell's database, or by geometry alone while that is empty."""
-        entries = self.store.sample(cell, count, self.rng)
-        if entries:
-            self.critic.refresh(entries)
-            return entries
-        return [self._new(candidate_task(cell, self.config, self.rng)) for _ in range(count)]
-
-    def _new(self, task: Task) -> Entry:
-        return self.store.make_entry(task)
-
-    def _predict(self, entries: list[Entry]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        f = self.network.predict([e.properties for e in entries], [e.q for e in entries])
-        return np.asarray(f)
-
-    def _proposal(
-        self,
-        entry: Entry,
-        requested: Requested,
-        category: Category,
-        f: float | None = None,
-        mu: float | None = None,
-        sigma: float | None = None,
-    ) -> Proposal:
-        self.proposed[category] += 1
-        if f is None:
-            reason = f"not used by {category}"
+    def _proposal(self, pick: Pick) -> Proposal:
+        entry = pick.entry
+        if pick.f is None:
+            reason = f"not used by {pick.category}"
+        elif "q" not in self.space.inputs:
+            reason = "not an input of f_pi"
         elif entry.q is not None:
             reason = "critic"
         elif entry.observed is None:
             reason = "no candidate in the database; by geometry alone"
         else:
             reason = "no critic yet"
-        robot, dolly = entry.scene.robot, entry.scene.dolly
+        version = entry.q_version
         return Proposal(
             id=uuid.uuid4().hex,
             task=entry.task,
-            requested=requested,
-            category=category,
-            properties=entry.properties,
+            requested=pick.requested,
+            category=pick.category,
+            why=pick.why,
+            properties=dict(entry.properties),
             q=entry.q,
+            q_version=f"{version.epoch}.{version.counter}" if version else None,
             q_reason=reason,
-            f=f,
-            mu=mu,
-            sigma=sigma,
-            robot=(robot.x, robot.y, robot.yaw),
-            dolly=(dolly.x, dolly.y, dolly.yaw),
+            f=pick.f,
+            mu=pick.mu,
+            sigma=pick.sigma,
+            robot=entry.poses and entry.poses[0],
+            dolly=entry.poses and entry.poses[1],
         )
 
-    def save(self, folder: Path) -> None:
-        """Writes f_pi, its outcomes and the gate; candidates are refilled by the actors."""
-        tensors, numbers = self.network.state()
-        state = {
-            "numbers": numbers,
-            "gate_open": self.gate.open,
-            "gate_outcomes": list(self.gate.outcomes),
-            "outcomes": self.outcomes,
-            "seen": self.seen.state(),
-            "proposed": self.proposed,
-        }
-        texts = {"state.json": json.dumps(state), "config.toml": self.config.to_toml()}
-        save_folder(folder, texts, {"success_network.safetensors": tensors})
+    def report(self, outcome: Outcome, origin: Origin) -> None:
+        """Takes how a task ended, once for each proposal; MessageError for an impossible task."""
+        by_itself, row = self._entry(outcome.task), None
+        with self._writing():
+            lease = self.database.end_lease(outcome.proposal) if outcome.proposal else None
+            result = Result(by_itself, "unserved", None, outcome.success)
+            if lease is not None:
+                result, row = Result(lease.entry, lease.category, lease.f, outcome.success), lease.candidate
+            if row is not None:
+                self.database.drop_candidate(row)
+            requested = lease.requested if lease else None
+            is_new = self.database.add_outcome(outcome.proposal, origin.actor, result, requested)
+            self.database.keep_origin(self.seen, origin)
+        self.seen.add(origin)
+        self.cells[result.entry.cell].entries.pop(row or 0, None)
+        if is_new:
+            self._learn(result)
 
-    def restore(self, folder: Path) -> None:
-        """Takes what `save` wrote, if it is there; raises UsageError when it does not fit."""
-        finish_saving(folder.parent)
-        if not (folder / "state.json").exists():
-            return
+    def _entry(self, task: object) -> Entry:
         try:
-            state = json.loads((folder / "state.json").read_text("utf-8"))
-            tensors = load_tensors(folder / "success_network.safetensors")
-            self.network.restore(tensors, state["numbers"])
-            self.gate.open = bool(state["gate_open"])
-            self.gate.outcomes.extend(state["gate_outcomes"])
-            self.seen.restore(state.get("seen", []))
-            self.outcomes, self.proposed = int(state["outcomes"]), Counter(state["proposed"])
-        except (KeyError, ValueError, TypeError) as error:
-            raise UsageError(
-                f"curriculum state {folder} does not fit: {error}; remove it to start afresh"
-            ) from None
+            return self.space.entry(task)  # type: ignore[arg-type]
+        except UsageError as error:
+            raise MessageError(f"task: {error}") from None
+
+    def _learn(self, result: Result) -> None:
+        self.outcomes += 1
+        if result.category == "gate":
+            self.gate.add(result.success)
+        if result.f is not None:
+            self.judged.append((result.f, result.success))
+        self.algorithm.report(result)
+
+    def check(self, message: Candidates) -> list[Entry]:
+        """Candidates with their geometry; raises MessageError for one that does not fit.
+
+        Touches nothing, and may run beside other threads: a millisecond for each.
+        """
+        entries = []
+        for candidate in message.candidates:
+            self.critic.check(candidate)
+            entry = self._entry(candidate.task)
+            entry.observed = candidate
+            entries.append(entry)
+        return entries
+
+    def add(self, entries: Iterable[Entry], origin: Origin) -> None:
+        """Takes candidates into the database, where the oldest of their cell make room."""
+        most, after = self.config.curriculum.store_per_cell, [cell.entries.copy() for cell in self.cells]
+        with self._writing():
+            for entry in entries:
+                self.database.add_candidate(entry, self.encoder)
+                assert entry.row is not None
+                held = after[entry.cell]
+                held[entry.row] = entry
+                if len(held) > most:
+                    self.database.drop_candidate(held.popitem(last=False)[0])
+            self.database.keep_origin(self.seen, origin)
+        self.seen.add(origin)
+        for cell, held in zip(self.cells, after, strict=True):
+            cell.entries = held
+
+    def stale(self) -> list[Entry]:
+        """Candidates whose Q could be newer, for `critic.refresh`, which may run beside other threads."""
+        return self.critic.stale(chain.from_iterable(cell.entries.values() for cell in self.cells))
+
+    def properties(self, query: ScoreQuery) -> list[dict[str, float]]:
+        """What f_pi sees of tasks; MessageError that names the field which does not fit.
+
+        Touches nothing, and may run beside other threads: a millisecond for each.
+        """
+        return [self._scored(index, item) for index, item in enumerate(query.tasks)]
+
+    def score(self, query: ScoreQuery, properties: list[dict[str, float]]) -> Scores:
+        """Predicted success of tasks with those properties."""
+        f = self.algorithm.score(properties, [item.q for item in query.tasks])
+        if f is None:
+            raise MessageError(f"{self.config.curriculum.algorithm} predicts nothing")
+        return Scores(f=f.tolist(), properties=properties, outcomes=self.outcomes)
+
+    def _scored(self, index: int, item: Scored) -> dict[str, float]:
+        if (item.task is None) == (item.properties is None):
+            raise MessageError(f"tasks.{index}: either task or properties")
+        if item.properties is None:
+            try:
+                return dict(self._entry(item.task).properties)
+            except MessageError as error:
+                raise MessageError(f"tasks.{index}.{error}") from None
+        needed = [name for name in self.space.inputs if name != "q"]
+        for name in needed:
+            if name not in item.properties:
+                raise MessageError(
+                    f"tasks.{index}.properties.{name}: missing; needed are {', '.join(needed)}"
+                )
+        for name in item.properties:
+            if name not in self.space.scales:
+                raise MessageError(f"tasks.{index}.properties.{name}: no property of these tasks")
+        return item.properties
+
+    def snapshot(self) -> Snapshot:
+        """The state for whoever asks."""
+        learned = self.algorithm if isinstance(self.algorithm, NavaclQ) else None
+        network = learned.network.file(learned.calibration) if learned else b""
+        f, success = zip(*self.judged, strict=True) if self.judged else ((), ())
+        return Snapshot(
+            algorithm=self.config.curriculum.algorithm,
+            outcomes=self.outcomes,
+            candidates=[len(cell.entries) for cell in self.cells],
+            leases=self.database.count_leases(),
+            gate_open=self.gate.open,
+            proposed=dict(self.proposed),
+            inputs=list(self.space.inputs) if network else [],
+            brier=brier_score(f, success) if f else None,
+            reliability=reliability(f, success) if f else [],
+            network=network,
+        )

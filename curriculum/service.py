@@ -1,4 +1,4 @@
-"""The curriculum process: serves proposals, takes outcomes and candidate starts in, saves what it learns."""
+"""The curriculum process: serves tasks and scores, takes outcomes and candidate starts into its database."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 import zenoh
@@ -22,25 +22,37 @@ from common.errors import UsageError
 from common.messages import (
     Candidates,
     Message,
+    Nothing,
+    Origin,
     Outcome,
     Proposals,
+    ScoreQuery,
     TaskQuery,
     Version,
     decode,
 )
 from common.telemetry import Reporter, stop_on_signals
 from common.weights import WeightsPuller
+from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.curriculum import Curriculum
+from curriculum.database import Database
 
 log = logging.getLogger(__name__)
-Report = TypeVar("Report", Outcome, Candidates)
+DATABASE = "curriculum.db"
 SAVE_SECONDS = 5.0
 CRITIC_REST_SECONDS = 6.0
 """Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
+TICK = 0.2
+"""Seconds between two looks around."""
+Q_SECONDS, Q_BATCH = 0.05, 64
+"""Of a tick at most for Q of candidates, so many at a time."""
 
 
 class CurriculumService:
-    """Serves a Curriculum on the bus. `digest` is the run's contract; None when it stands alone."""
+    """Serves a Curriculum on the bus, from RUN/curriculum.db or, with `folder` None, from memory.
+
+    `digest` is the run's contract; None when it stands alone.
+    """
 
     def __init__(
         self,
@@ -52,12 +64,11 @@ class CurriculumService:
         group: str = LOCAL,
     ) -> None:
         torch.set_num_threads(1)
-        self.curriculum = Curriculum(config)
-        self._folder = folder
-        if folder is not None:
-            self.curriculum.restore(folder)
+        sync = config.learner.durability == "host"
+        database = Database(folder / DATABASE if folder else None, sync)
+        self.curriculum = Curriculum(config, database, (digest or {}).get("encoder", ""))
         self._digest = digest
-        self._failed_writes, self._failed_at = 0, 0.0
+        self._failed_writes, self._failed_at, self._closed = 0, 0.0, False
         self._lock = threading.Lock()
         keys = Keys(run)
         member = Member("curriculum", group, "curriculum")
@@ -67,72 +78,112 @@ class CurriculumService:
         )
         self._servers = [
             serve(session, keys.task, TaskQuery, self._propose),
-            self._receiver(session, keys.result, Outcome, self.curriculum.report),
-            self._receiver(session, keys.candidates, Candidates, self.curriculum.add),
+            serve(session, keys.score, ScoreQuery, self._score),
+            serve(session, keys.snapshot, Nothing, self._snapshot),
+            self._receiver(session, keys.result, self._take_outcome, Outcome.max_bytes),
+            self._receiver(session, keys.candidates, self._take_candidates, Candidates.max_bytes),
         ]
         self._reporter = Reporter(session, keys, member)
 
     def run(self) -> None:
-        """Serves until SIGTERM or SIGINT; keeps weights fresh, reports and saves meanwhile."""
+        """Serves until SIGTERM or SIGINT; keeps weights and Q fresh, reports and saves meanwhile."""
         saved, stopping = time.monotonic(), stop_on_signals()
-        while not stopping.wait(0.2):
-            newest = self._weights.newest if self._weights else None
-            if newest is not None and self.curriculum.critic.version != newest[0]:
-                try:
-                    with self._lock:
-                        self.curriculum.critic.load(*newest)
-                except ValueError as error:
-                    raise UsageError(
-                        f"the learner has other networks than are configured here: {error}"
-                    ) from None
+        while not stopping.wait(TICK):
+            self._refresh_q()
             if self._reporter.due:
                 self._report()
             if time.monotonic() - saved >= SAVE_SECONDS:
                 saved = time.monotonic()
                 self.save()
 
+    def _refresh_q(self) -> None:
+        """Takes newer weights, and values candidates by them, a while at a time."""
+        critic, newest = self.curriculum.critic, self._weights.newest if self._weights else None
+        if newest is not None and critic.version != newest[0]:
+            try:
+                critic.load(*newest)
+            except ValueError as error:
+                raise UsageError(
+                    f"the learner has other networks than are configured here: {error}"
+                ) from None
+        until = time.monotonic() + Q_SECONDS
+        with self._lock:
+            stale = self.curriculum.stale()
+        while stale and time.monotonic() < until:
+            critic.refresh(stale[:Q_BATCH])
+            del stale[:Q_BATCH]
+
     def save(self) -> None:
-        """Writes the state to the folder, if there is one; a full disk must not end the service."""
-        if self._folder is None:
-            return
-        try:
-            with self._lock:
-                self.curriculum.save(self._folder)
-        except OSError as error:
-            self._failed_writes, self._failed_at = self._failed_writes + 1, time.monotonic()
-            log.error("cannot write to %s: %s; it is tried again", self._folder, error.strerror or error)
+        """Keeps the state; a full disk must not end the service."""
+        with suppress(OSError), self._writing():
+            self.curriculum.save()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """With the curriculum to itself; an OSError is noted, after which the curriculum is as it was."""
+        with self._lock:
+            try:
+                yield
+            except OSError as error:
+                self._failed_writes, self._failed_at = self._failed_writes + 1, time.monotonic()
+                log.error("cannot write: %s; it is tried again", error.strerror or error)
+                raise
 
     def close(self) -> None:
-        """Stops serving and saves."""
+        """Stops serving and saves; once is enough."""
+        if self._closed:
+            return
+        self._closed = True
         for server in self._servers:
             server.close()
         self.save()
+        self.curriculum.database.close()
 
     def _propose(self, query: TaskQuery) -> Message:
         with self._lock:
             return Proposals(tasks=[self.curriculum.propose(query.cell, query.t) for _ in range(query.count)])
 
-    def _receiver(
-        self, session: zenoh.Session, channel: str, kind: type[Report], add: Callable[[Report], None]
-    ) -> Receiver:
-        def take(parcel: Parcel) -> None:
-            message = decode(kind, parcel.payload)
-            if self._digest is not None:
-                check_digest(self._digest, message.digest)
-            with self._lock:
-                add(message)
-                self.curriculum.seen.add(parcel.origin)
+    def _score(self, query: ScoreQuery) -> Message:
+        properties = self.curriculum.properties(query)
+        with self._lock:
+            return self.curriculum.score(query, properties)
 
-        return Receiver(session, channel, take, self.curriculum.seen.seen, kind.max_bytes)
+    def _snapshot(self, question: Nothing) -> Message:
+        with self._lock:
+            return self.curriculum.snapshot()
+
+    def _receiver(
+        self, session: zenoh.Session, channel: str, take: Callable[[Parcel], None], max_bytes: int
+    ) -> Receiver:
+        def seen(origin: Origin) -> bool:
+            return self.curriculum.seen.seen(origin)
+
+        return Receiver(session, channel, take, seen, max_bytes)
+
+    def _take_outcome(self, parcel: Parcel) -> None:
+        message = decode(Outcome, parcel.payload)
+        self._check(message.digest)
+        with self._writing():
+            self.curriculum.report(message, parcel.origin)
+
+    def _take_candidates(self, parcel: Parcel) -> None:
+        message = decode(Candidates, parcel.payload)
+        self._check(message.digest)
+        entries = self.curriculum.check(message)
+        with self._writing():
+            self.curriculum.add(entries, parcel.origin)
+
+    def _check(self, digest: dict[str, str]) -> None:
+        if self._digest is not None:
+            check_digest(self._digest, digest)
 
     def _report(self) -> None:
         state, version = self.curriculum, self.curriculum.critic.version or Version()
         values: dict[str, float | int | str] = {
-            "candidates": len(state.store),
+            "candidates": len(state),
             "outcomes": state.outcomes,
             "gate_open": int(state.gate.open),
             "gate_success": round(sum(state.gate.outcomes) / max(len(state.gate.outcomes), 1), 3),
-            "fits": state.network.fits,
             "weights": f"{version.epoch}.{version.counter}",
             "inbox": sum(map(len, self._servers)),
             "failed_writes": self._failed_writes,
@@ -141,6 +192,9 @@ class CurriculumService:
         }
         if self._failed_writes:
             values["failed_s"] = round(time.monotonic() - self._failed_at, 1)
-        if math.isfinite(state.network.loss):
-            values["loss"] = round(state.network.loss, 4)
+        if isinstance(state.algorithm, NavaclQ):
+            network = state.algorithm.network
+            values["fits"] = network.fits
+            if math.isfinite(network.loss):
+                values["loss"] = round(network.loss, 4)
         self._reporter.report(values)

@@ -23,7 +23,6 @@ from common.delivery import Sender, Spool
 from common.errors import UsageError
 from common.link import end_process, make_link, open_client
 from common.messages import Candidate, Candidates, Episode, Outcome, TaskQuery, encode
-from common.tasks import GeometricProperties
 from common.telemetry import Reporter, exit_on_signals, start_logging, stop_on_signals
 from common.weights import WeightsPuller
 from tests.helpers import tiny_episode
@@ -33,16 +32,7 @@ SPOOL_BYTES = 2**20
 
 def outcome_and_candidate(episode: Episode, proposal: str) -> tuple[Outcome, Candidates]:
     """What an actor also reports, to the curriculum."""
-    numbers = dict.fromkeys(GeometricProperties.model_fields, 0.5)
-    outcome = Outcome(
-        digest=episode.digest,
-        proposal=proposal,
-        task=episode.task,
-        properties=GeometricProperties(**numbers),
-        q=None,
-        success=True,
-        category="random",
-    )
+    outcome = Outcome(digest=episode.digest, proposal=proposal, task=episode.task, success=True)
     row = Candidate(task=episode.task, visual=episode.visual[0], lidar=episode.lidar[0])
     return outcome, Candidates(digest=episode.digest, candidates=[row])
 

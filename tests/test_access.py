@@ -238,8 +238,8 @@ def test_a_group_says_nothing_under_the_name_of_another(one, other):
         "put": [keys.stat(member), keys.version],
         "liveliness_token": [keys.live(member, "1")],
         "declare_liveliness_subscriber": [keys.live(member, "1")],
-        "declare_queryable": [keys.contract, keys.weights("policy"), keys.task],
-        "reply": [keys.contract, keys.weights("policy"), keys.task],
+        "declare_queryable": [keys.contract, keys.weights("policy"), keys.task, keys.score, keys.snapshot],
+        "reply": [keys.contract, keys.weights("policy"), keys.task, keys.score, keys.snapshot],
         "delete": [keys.version, keys.stat(Member("actor", one, "0"))],
     }
     for message, forbidden in sent.items():
@@ -259,7 +259,11 @@ def test_only_hubs_offer_weights_and_contracts_and_only_actors_deliver():
         assert may(groups, subject, "query", "ingress", keys.contract)
         delivers = may(groups, subject, "query", "ingress", f"{keys.trajectory}/actor-a/0")
         assert delivers == (subject == "actor-a")
-    assert may(groups, "curriculum", "declare_queryable", "ingress", keys.task)
+    for question in (keys.task, keys.score, keys.snapshot):
+        assert may(groups, "curriculum", "declare_queryable", "ingress", question)
+        assert may(groups, "actor-a", "query", "ingress", question)
+        assert may(groups, "operator", "query", "ingress", question)
+        assert not may(groups, "curriculum", "query", "ingress", question)
     assert not may(groups, "actor-a", "query", "ingress", keys.weights("critic"))
 
 
@@ -655,7 +659,8 @@ def test_an_operator_hears_everything(place, keys):
 def test_an_operator_sends_nothing_but_questions(place, keys, serve):
     asked: list[str] = []
     store = Store(place.hub, keys.trajectory)
-    answers = {keys.contract: b"contract", keys.weights("policy"): b"weights", keys.task: b"task"}
+    questions = {keys.task: b"task", keys.score: b"score", keys.snapshot: b"snapshot"}
+    answers = {keys.contract: b"contract", keys.weights("policy"): b"weights", **questions}
     serve(place.hub, keys.contract, b"contract")
     serve(place.hub, keys.weights("policy"), b"weights")
     with (
@@ -664,7 +669,8 @@ def test_an_operator_sends_nothing_but_questions(place, keys, serve):
         place.join("actor-a") as a,
         place.join("curriculum") as curriculum,
     ):
-        serve(curriculum, keys.task, b"task")
+        for key in questions:
+            serve(curriculum, key, answers[key])
         for key, text in answers.items():
             assert insist_on_answer(lambda k=key: ask_bytes(a, k, b"")) == text
         listening = [hear_versions(session, keys) for session in (place.hub, a, screen)]
@@ -681,7 +687,7 @@ def test_an_operator_sends_nothing_but_questions(place, keys, serve):
         for key in (f"{keys.trajectory}/actor-a/0", f"{keys.trajectory}/operator/0", keys.weights("policy")):
             with pytest.raises(NoAnswerError, match="nobody serves"):
                 ask_bytes(operator, key, b"")
-        for key in (keys.contract, keys.task):  # after all of these
+        for key in (keys.contract, *questions):  # after all of these
             assert ask_bytes(operator, key, b"") == answers[key]
 
         declared = [operator.declare_queryable(key, lambda query: asked.append("")) for key in answers]

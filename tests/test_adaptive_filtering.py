@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import CurriculumConfig, resolve
-from curriculum.adaptive_filtering import (
+from curriculum.algorithms.adaptive_filtering import (
     fit_normal,
     get_anchored_task,
     get_dynamic_task,

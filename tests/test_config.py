@@ -9,7 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.config import (
+    GEOMETRIC,
+    INPUTS,
+    VARIANTS,
     Config,
+    Variant,
     differing_keys,
     known_keys,
     override,
@@ -31,7 +35,6 @@ from common.world_config import (
 )
 
 PRESETS = ("paper", "fast", "smoke")
-VARIANTS = ("navacl-q", "rnd", "e2e")
 
 TASK = {  # facts.md, section 1: the same in every preset
     "world.control_period": 0.180,
@@ -121,6 +124,7 @@ PAPER = {  # facts.md, sections 2 and 3
     "actor.worlds": 9,
     "actor.refresh": "episode",
     "curriculum.algorithm": "navacl-q",
+    "curriculum.inputs": ("distance", "agent_clearance", "goal_clearance", "relative_angle", "q"),
     "curriculum.beta": 1.0,
     "curriculum.gamma": 0.1,
     "curriculum.chi": 0.95,
@@ -194,6 +198,73 @@ def test_variants_change_the_curriculum_or_the_encoder():
     assert not resolve(variant="rnd").curriculum.gate.enabled
     assert e2e.encoder.end_to_end
     assert e2e.curriculum.algorithm == "navacl-q"
+    assert set(VARIANTS) == set(get_args(Variant))
+
+
+@pytest.mark.parametrize(
+    ("variant", "algorithm", "inputs", "gate", "uses_q"),
+    [
+        ("navacl-q", "navacl-q+", INPUTS, True, True),
+        ("navacl-q-letter", "navacl-q", (*GEOMETRIC[:4], "q"), False, True),
+        ("navacl", "navacl-q+", GEOMETRIC[:4], True, False),
+        ("q-only", "navacl-q+", ("q",), True, True),
+        ("schedule", "schedule", INPUTS, False, False),
+        ("sfl", "sfl", INPUTS, False, False),
+        ("rnd", "rnd", INPUTS, False, False),
+        ("e2e", "navacl-q+", INPUTS, True, True),
+    ],
+)
+def test_variant_names_a_curriculum(variant, algorithm, inputs, gate, uses_q):
+    found = resolve("fast", variant=variant).curriculum
+    assert (found.algorithm, found.inputs, found.gate.enabled) == (algorithm, inputs, gate)
+    assert found.uses_q is uses_q, "whether actors encode candidates"
+
+
+def test_variant_to_the_letter_has_the_curriculum_of_the_paper_preset_but_for_its_pace():
+    differing = differing_keys(resolve(variant="navacl-q-letter").curriculum, resolve("paper").curriculum)
+    assert [key for key, _, _ in differing] == ["random_steps"]
+
+
+PARAMETERS = [
+    {"name": "wind", "low": -1.0, "high": 8.0, "easy": 0.0},
+    {"name": "mass", "low": 1.0, "high": 3.0, "easy": 1.0},
+]
+
+
+def test_parameters_of_another_environment_are_kept_in_order_and_need_no_q():
+    config = validate({"curriculum": {"parameters": PARAMETERS}})
+    assert [p.model_dump() for p in config.curriculum.parameters] == PARAMETERS
+    assert not config.curriculum.uses_q
+    assert parse(config.to_toml()) == config
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"name": "1st"},
+        {"name": ""},
+        {"name": "a" * 41},
+        {"name": "a.b"},
+        {"low": 9.0},
+        {"easy": 8.5},
+        {"easy": -1.5},
+        {"low": 8.0, "easy": 8.0},
+        {"high": math.inf},
+        {"high": math.nan},
+        {"step": 1.0},
+    ],
+)
+def test_impossible_parameters_are_usage_errors(wrong):
+    with pytest.raises(UsageError, match=r"'curriculum\.parameters\.0"):
+        validate({"curriculum": {"parameters": [PARAMETERS[0] | wrong]}})
+
+
+@pytest.mark.parametrize(
+    ("inputs", "said"), [([], "at least 1"), (["q", "q"], "only once"), (["mass"], "'mass' is none of")]
+)
+def test_impossible_inputs_are_usage_errors(inputs, said):
+    with pytest.raises(UsageError, match=rf"'curriculum\.inputs' = .*{said}"):
+        validate({"curriculum": {"inputs": inputs}})
 
 
 def test_later_sources_win(tmp_path):
@@ -390,7 +461,11 @@ def test_override_of_one_key_leaves_its_neighbours():
     ("arguments", "said"),
     [
         ({"preset": "papers"}, "preset 'papers' does not exist; choose one of paper, fast, smoke"),
-        ({"variant": "x"}, "variant 'x' does not exist; choose one of navacl-q, rnd, e2e"),
+        (
+            {"variant": "x"},
+            "variant 'x' does not exist; choose one of navacl-q, rnd, e2e, navacl-q-letter, navacl, q-only, "
+            "schedule, sfl",
+        ),
     ],
 )
 def test_unknown_preset_and_variant_are_usage_errors(arguments, said):

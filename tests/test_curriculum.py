@@ -1,26 +1,38 @@
 import json
 import math
+import sqlite3
 from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from common.config import Config, resolve
+from common.config import GEOMETRIC, Config, resolve
 from common.errors import UsageError
-from common.messages import Candidate, MessageError, Outcome, Proposal, Version
+from common.messages import Candidate, Candidates, MessageError, Origin, Outcome, Proposal, Version
 from common.networks import Perception, Policy, TwinCritic, state_of
 from common.observation import ObservationLayout
-from common.tasks import GeometricProperties, Task, build_scene, geometric_properties
-from curriculum.adaptive_filtering import task_type_probabilities
+from common.tasks import Task, build_scene, geometric_properties
+from curriculum.algorithms.adaptive_filtering import task_type_probabilities
+from curriculum.algorithms.navacl_q import NavaclQ
+from curriculum.critic import CriticView
 from curriculum.curriculum import Curriculum, Gate
-from curriculum.task_store import CriticView, Entry, TaskStore
+from curriculum.database import Database
+from curriculum.success_network import SuccessNetwork
+from curriculum.task_space import Entry, make_space
 from tests.helpers import small_config
 
 OPEN = "curriculum.gate.enabled=false"
 PLUS = small_config(OPEN)
-LETTER = small_config(OPEN, "curriculum.algorithm='navacl-q'")
+LETTER = small_config(OPEN, "curriculum.algorithm='navacl-q'", f"curriculum.inputs={[*GEOMETRIC[:4], 'q']}")
 RND = small_config(OPEN, "curriculum.algorithm='rnd'")
+FEW, FEW_LETTER = (
+    config.model_copy(update={"curriculum": config.curriculum.model_copy(update={"filter_samples": 8})})
+    for config in (PLUS, LETTER)
+)
+"""An empty database is soon made up for."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -65,41 +77,67 @@ class Learner:
         return min(first, second)
 
 
-def with_candidates(config: Config, count: int, cell: int = 0) -> tuple[Curriculum, dict[int, Candidate]]:
+def origin(seq: int) -> Origin:
+    return Origin(actor="local/a1", boot="b1", seq=seq)
+
+
+def add(curriculum: Curriculum, *candidates: Candidate, seq: int = 0) -> None:
+    """Takes candidates in as the service does."""
+    curriculum.add(curriculum.check(Candidates(digest={}, candidates=list(candidates))), origin(seq))
+
+
+def with_candidates(
+    config: Config, count: int, cell: int = 0, database: Database | None = None
+) -> tuple[Curriculum, dict[int, Candidate]]:
     """A curriculum with candidates in one cell, by their seeds."""
-    curriculum = Curriculum(config)
+    curriculum = Curriculum(config, database)
     candidates = {seed: make_candidate(config, seed, cell) for seed in range(count)}
-    for candidate in candidates.values():
-        curriculum.store.add([candidate])
+    add(curriculum, *candidates.values())
     return curriculum, candidates
 
 
+def value(curriculum: Curriculum, learner: Learner, version: Version | None = None) -> None:
+    """Gives every candidate its Q under the weights of a learner."""
+    curriculum.critic.load(version or Version(epoch=1), learner.tensors())
+    curriculum.critic.refresh(curriculum.stale())
+
+
 def outcome_of(proposal: Proposal, success: bool) -> Outcome:
-    return Outcome(
-        digest={},
-        proposal=proposal.id,
-        task=proposal.task,
-        properties=proposal.properties,
-        q=proposal.q,
-        success=success,
-        category=proposal.category,
-    )
+    return Outcome(proposal=proposal.id, task=proposal.task, success=success)
+
+
+def task_of(proposal: Proposal) -> Task:
+    assert isinstance(proposal.task, Task)
+    return proposal.task
+
+
+def seeds_in(curriculum: Curriculum, cell: int = 0) -> list[int]:
+    """Of a cell's candidates, oldest first."""
+    return [entry.task.seed for entry in curriculum.cells[cell].entries.values()]
+
+
+def network_of(curriculum: Curriculum) -> SuccessNetwork:
+    assert isinstance(curriculum.algorithm, NavaclQ)
+    return curriculum.algorithm.network
+
+
+def predictions(curriculum: Curriculum) -> list[float]:
+    """Of some tasks, without Q."""
+    tasks = [Task(cell=i, seed=i, start=PLUS.world.start) for i in range(9)]
+    return network_of(curriculum).predict([geometry(task) for task in tasks], [None] * 9).tolist()
+
+
+def geometry(task: Task) -> Mapping[str, float]:
+    return geometric_properties(task, build_scene(task, PLUS.world)).model_dump()
 
 
 def train(curriculum: Curriculum, outcomes: int) -> None:
     """Lets f_pi learn that success is a matter of distance; f rises through 0.5 at 3 m."""
     rng = np.random.default_rng(0)
     for _ in range(outcomes):
-        distance, a, b, c, d, e = rng.uniform((1.5, 1, 1, 0, 0, 0), (5, 5, 5, 1.5, 1.5, 0.5))
-        properties = GeometricProperties(
-            distance=distance,
-            agent_clearance=a,
-            goal_clearance=b,
-            relative_angle=c,
-            lateral_offset=d,
-            approach_angle=e,
-        )
-        curriculum.network.add(properties, None, bool(distance + rng.normal() < 3))
+        values = rng.uniform((1.5, 1, 1, 0, 0, 0), (5, 5, 5, 1.5, 1.5, 0.5)).tolist()
+        properties = dict(zip(GEOMETRIC, values, strict=True))
+        network_of(curriculum).add(properties, None, bool(values[0] + rng.normal() < 3))
 
 
 # The gate
@@ -136,29 +174,64 @@ def test_gate_that_is_disabled_is_open():
 
 def test_tasks_before_the_gate_are_near_and_straight_and_carry_its_name():
     curriculum = Curriculum(gated())
+    ranges = curriculum.config.curriculum.gate.ranges
     for cell in range(9):
         proposal = curriculum.propose(cell, 0)
-        assert proposal.category == "gate"
-        assert proposal.task.cell == cell
-        assert proposal.task.start.model_dump() == curriculum.config.curriculum.gate.ranges.model_dump()
-        assert proposal.properties.distance <= proposal.task.start.distance_max
+        assert (proposal.category, proposal.requested) == ("gate", "random")
+        assert "favourable starts" in proposal.why
+        assert task_of(proposal).cell == cell
+        assert task_of(proposal).start.model_dump() == ranges.model_dump()
+        assert proposal.properties["distance"] <= ranges.distance_max
         assert (proposal.q, proposal.f, proposal.mu, proposal.sigma) == (None, None, None, None)
         assert proposal.q_reason == "not used by gate"
 
 
 def test_only_outcomes_of_favourable_starts_open_the_gate():
     curriculum = Curriculum(gated(window=4))
-    inside = curriculum.propose(0, 0)
-    for category in ("random", "easy", "frontier", "unserved", "rnd"):
-        for _ in range(4):
-            curriculum.report(outcome_of(inside, True).model_copy(update={"category": category}))
-    assert not curriculum.gate.open
-    for _ in range(4):
-        assert curriculum.propose(0, 0).category == "gate"
-        curriculum.report(outcome_of(inside, True))
+    favourable = curriculum.propose(0, 0)
+    for seq in range(8):  # of nobody's proposal, and of one that is not known here
+        unserved = outcome_of(favourable, True).model_copy(update={"proposal": (None, f"p-{seq}")[seq % 2]})
+        curriculum.report(unserved, origin(seq))
+    assert list(curriculum.gate.outcomes) == []
+    for seq in range(4):
+        proposal = favourable if seq == 0 else curriculum.propose(0, 0)
+        assert proposal.category == "gate"
+        assert not curriculum.gate.open
+        curriculum.report(outcome_of(proposal, True), origin(8 + seq))
     assert curriculum.gate.open
-    assert curriculum.propose(0, 0).category in ("easy", "frontier", "random")
-    assert curriculum.outcomes == 24
+    after = curriculum.propose(0, 0)
+    assert after.category in ("easy", "frontier", "random")
+    curriculum.report(outcome_of(after, True), origin(12))
+    assert len(curriculum.gate.outcomes) == 4
+    assert curriculum.outcomes == 13
+    on_record = [outcome.result.category for outcome in curriculum.database.outcomes()]
+    assert on_record == ["unserved"] * 8 + ["gate"] * 4 + [after.category]
+
+
+def test_outcome_counts_once_for_each_proposal():
+    curriculum = Curriculum(gated(window=4))
+    proposal = curriculum.propose(0, 0)
+    for seq in range(3):
+        curriculum.report(outcome_of(proposal, True), origin(seq))
+    assert (curriculum.outcomes, list(curriculum.gate.outcomes)) == (1, [True])
+
+
+def test_outcome_is_learned_with_what_the_proposal_was_made_of():
+    curriculum, candidates = with_candidates(PLUS, 3)
+    old, new = Learner(PLUS, 1), Learner(PLUS, 2)
+    value(curriculum, old, Version(epoch=1))
+    proposal = curriculum.propose(0, 0)
+    value(curriculum, new, Version(epoch=2))
+    assert new.q(candidates[task_of(proposal).seed]) != proposal.q
+    curriculum.report(outcome_of(proposal, True), origin(1))
+    unserved = Task(cell=3, seed=8, start=PLUS.world.start)
+    curriculum.report(Outcome(proposal=None, task=unserved, success=False), origin(2))
+    first, second = (outcome.result for outcome in curriculum.database.outcomes())
+    assert (first.entry.properties, first.entry.q) == (proposal.properties, proposal.q)
+    assert (first.category, first.f, first.success) == (proposal.category, proposal.f, True)
+    assert (second.entry.task, second.entry.properties) == (unserved, geometry(unserved))
+    assert (second.category, second.entry.q, second.f, second.success) == ("unserved", None, None, False)
+    assert list(curriculum.judged) == [(proposal.f, True)]
 
 
 # Random starts
@@ -166,22 +239,20 @@ def test_only_outcomes_of_favourable_starts_open_the_gate():
 
 def test_rnd_proposes_the_full_distribution_and_uses_neither_f_nor_q():
     curriculum, candidates = with_candidates(RND, 5)
-    curriculum.critic.load(Version(epoch=1), Learner(RND).tensors())
-    before = [p.clone() for p in curriculum.network.net.parameters()]
+    value(curriculum, Learner(RND))
     seeds = set()
-    for _ in range(40):
+    for seq in range(40):
         proposal = curriculum.propose(0, 10**9)
         assert (proposal.requested, proposal.category) == ("random", "rnd")
-        assert proposal.task.start == RND.world.start
+        assert task_of(proposal).start == RND.world.start
         assert (proposal.q, proposal.f, proposal.mu, proposal.sigma) == (None, None, None, None)
-        assert proposal.q_reason == "not used by rnd"
-        curriculum.report(outcome_of(proposal, True))
-        seeds.add(proposal.task.seed)
+        assert (proposal.q_reason, proposal.q_version) == ("not used by rnd", None)
+        curriculum.report(outcome_of(proposal, True), origin(seq + 1))
+        seeds.add(task_of(proposal).seed)
     assert len(seeds) == 40
     assert not seeds & set(candidates)
-    assert len(curriculum.store) == 5
-    assert curriculum.network.fits == 0
-    assert all(torch.equal(a, b) for a, b in zip(before, curriculum.network.net.parameters(), strict=True))
+    assert len(curriculum) == 5
+    assert curriculum.outcomes == 40
     assert curriculum.proposed == {"rnd": 40}
 
 
@@ -190,9 +261,9 @@ def test_rnd_proposes_the_full_distribution_and_uses_neither_f_nor_q():
 
 def test_empty_database_is_made_up_for_by_geometry_alone_and_the_proposal_says_so():
     curriculum = Curriculum(PLUS)
-    curriculum.critic.load(Version(epoch=1), Learner(PLUS).tensors())
+    value(curriculum, Learner(PLUS))
     proposal = curriculum.propose(4, 0)
-    assert proposal.task.cell == 4
+    assert task_of(proposal).cell == 4
     assert proposal.q is None
     assert proposal.q_reason == "no candidate in the database; by geometry alone"
     assert proposal.f is not None
@@ -204,29 +275,35 @@ def test_empty_database_is_made_up_for_by_geometry_alone_and_the_proposal_says_s
 def test_candidates_without_a_critic_have_no_q_and_the_proposal_says_so():
     curriculum, candidates = with_candidates(PLUS, 5)
     proposal = curriculum.propose(0, 0)
-    assert proposal.task.seed in candidates
-    assert (proposal.q, proposal.q_reason) == (None, "no critic yet")
+    assert task_of(proposal).seed in candidates
+    assert (proposal.q, proposal.q_version, proposal.q_reason) == (None, None, "no critic yet")
 
 
 @pytest.mark.parametrize("config", [PLUS, LETTER])
 def test_q_is_the_minimum_of_the_twin_critics_at_the_greedy_action(config):
     curriculum, candidates = with_candidates(config, 6)
     learner = Learner(config)
-    curriculum.critic.load(Version(epoch=1, counter=3), learner.tensors())
+    value(curriculum, learner, Version(epoch=1, counter=3))
     found = set()
     for _ in range(6):
         proposal = curriculum.propose(0, 0)
-        assert proposal.q_reason == "critic"
-        assert proposal.q == pytest.approx(learner.q(candidates[proposal.task.seed]), abs=1e-5)
+        assert (proposal.q_reason, proposal.q_version) == ("critic", "1.3")
+        assert proposal.q == pytest.approx(learner.q(candidates[task_of(proposal).seed]), abs=1e-5)
         found.add(round(proposal.q, 4))
     assert len(found) == 6
 
 
+def observed(config: Config, candidate: Candidate) -> Entry:
+    entry = make_space(config).entry(candidate.task)
+    entry.observed = candidate
+    return entry
+
+
 def test_q_end_to_end_is_that_of_the_encoded_frame():
     config = small_config(OPEN, "encoder.end_to_end=true")
-    learner, view, store = Learner(config), CriticView(config), TaskStore(config)
+    learner, view = Learner(config), CriticView(config)
     candidate = make_candidate(config, 3)
-    entry = store.make_entry(candidate.task, candidate)
+    entry = observed(config, candidate)
     view.load(Version(epoch=1), learner.tensors())
     view.refresh([entry])
     assert learner.perception.encoder is not None
@@ -244,10 +321,9 @@ def valued(view: CriticView, entries: list[Entry]) -> list[float | None]:
 
 
 def test_q_is_cached_until_weights_of_another_version_come():
-    store, view = TaskStore(PLUS), CriticView(PLUS)
-    candidates = [make_candidate(PLUS, seed) for seed in range(4)]
-    entries = [store.make_entry(c.task, c) for c in candidates]
-    bare = store.make_entry(candidates[0].task)
+    view, candidates = CriticView(PLUS), [make_candidate(PLUS, seed) for seed in range(4)]
+    entries = [observed(PLUS, c) for c in candidates]
+    bare = make_space(PLUS).entry(candidates[0].task)
     assert valued(view, [*entries, bare]) == [None] * 5
     old, new = Learner(PLUS, 1), Learner(PLUS, 2)
     view.load(Version(epoch=1, counter=9), old.tensors())
@@ -271,17 +347,15 @@ def test_weights_that_do_not_fit_are_refused_naming_the_tensor():
 def test_mu_and_sigma_are_fitted_to_the_predictions_over_the_database(config):
     curriculum, candidates = with_candidates(config, 12)
     learner = Learner(config)
-    curriculum.critic.load(Version(epoch=1), learner.tensors())
-    properties = {
-        seed: geometric_properties(c.task, build_scene(c.task, config.world))
-        for seed, c in candidates.items()
-    }
-    f = curriculum.network.predict(list(properties.values()), [learner.q(c) for c in candidates.values()])
+    value(curriculum, learner)
+    properties = {seed: geometry(c.task) for seed, c in candidates.items()}
+    q: list[float | None] = [learner.q(c) for c in candidates.values()]
+    f = network_of(curriculum).predict(list(properties.values()), q)
     proposal = curriculum.propose(0, 0)
-    assert proposal.properties == properties[proposal.task.seed]
+    assert proposal.properties == properties[task_of(proposal).seed]
     assert proposal.mu == pytest.approx(f.mean(), abs=1e-5)
     assert proposal.sigma == pytest.approx(f.std(), abs=1e-5)
-    assert proposal.f == pytest.approx(f[proposal.task.seed], abs=1e-5)
+    assert proposal.f == pytest.approx(f[task_of(proposal).seed], abs=1e-5)
 
 
 def test_proposals_to_the_letter_meet_algorithm_1():
@@ -306,14 +380,12 @@ def test_proposals_to_the_letter_meet_algorithm_1():
 
 
 def test_frontier_of_plus_lies_near_one_half_when_f_spreads():
-    curriculum = Curriculum(small_config(OPEN, "curriculum.easy_share=0"))
-    for seed in range(100):
-        curriculum.store.add([make_candidate(PLUS, seed)])
+    curriculum, _ = with_candidates(small_config(OPEN, "curriculum.easy_share=0"), 100)
     train(curriculum, 640)
     proposals = [curriculum.propose(0, 0) for _ in range(5)]
     assert {p.category for p in proposals} == {"frontier"}
     assert all(abs(p.f - 0.5) < 0.25 for p in proposals if p.f is not None)
-    assert all(2 < p.properties.distance < 4 for p in proposals), "success ends at 3 m"
+    assert all(2 < p.properties["distance"] < 4 for p in proposals), "success ends at 3 m"
     assert all(p.sigma is not None and p.sigma > 0.2 for p in proposals)
 
 
@@ -327,50 +399,68 @@ def test_requests_follow_the_asking_agents_steps():
     assert early.propose(0, 0).requested == "random"
 
 
-def test_proposed_candidates_leave_the_database():
+def test_proposed_candidates_are_in_nobody_elses_hands_and_leave_the_database_when_reported():
     curriculum, candidates = with_candidates(PLUS, 30)
-    seeds = [curriculum.propose(0, 0).task.seed for _ in range(30)]
-    assert sorted(seeds) == sorted(candidates)
-    assert len(curriculum.store) == 0
-    assert curriculum.propose(0, 0).task.seed not in candidates
+    proposals = [curriculum.propose(0, 0) for _ in range(30)]
+    assert sorted(task_of(p).seed for p in proposals) == sorted(candidates)
+    assert len(curriculum) == curriculum.snapshot().leases == 30
+    assert task_of(curriculum.propose(0, 0)).seed not in candidates
+    curriculum.report(outcome_of(proposals[3], True), origin(1))
+    assert seeds_in(curriculum) == [seed for seed in range(30) if seed != task_of(proposals[3]).seed]
+    assert curriculum.snapshot().leases == 30, "one of them of a task made up by geometry"
+
+
+def test_proposed_candidate_that_nobody_reports_is_proposed_again():
+    config = small_config(OPEN, "curriculum.lease=1e-9")
+    curriculum, _ = with_candidates(config, 2)
+    proposals = [curriculum.propose(0, 0) for _ in range(20)]
+    assert Counter(task_of(p).seed for p in proposals).keys() == {0, 1}
+    last = task_of(proposals[-1]).seed
+    curriculum.report(outcome_of(proposals[-1], True), origin(1))
+    assert seeds_in(curriculum) == [1 - last]
 
 
 def test_candidates_are_proposed_in_their_own_cell_only():
     curriculum = Curriculum(PLUS)
-    for seed in range(6):
-        curriculum.store.add([make_candidate(PLUS, seed, cell=seed % 2)])
-    assert [curriculum.store.count(cell) for cell in range(3)] == [3, 3, 0]
-    assert {curriculum.propose(1, 0).task.seed for _ in range(3)} == {1, 3, 5}
+    add(curriculum, *(make_candidate(PLUS, seed, cell=seed % 2) for seed in range(6)))
+    assert curriculum.snapshot().candidates == [3, 3, *[0] * 7]
+    assert {task_of(curriculum.propose(1, 0)).seed for _ in range(3)} == {1, 3, 5}
 
 
-# The database
+# The candidates
 
 
 def test_database_holds_a_bounded_number_per_cell_and_the_oldest_make_room():
     config = small_config(OPEN, "curriculum.store_per_cell=5")
-    store = TaskStore(config)
-    for seed in range(8):
-        store.add([make_candidate(config, seed)])
-    store.add([make_candidate(config, 100, cell=1)])
-    assert (len(store), store.count(0), store.count(1)) == (6, 5, 1)
-    kept = store.sample(0, 100, np.random.default_rng(0))
-    assert sorted(entry.task.seed for entry in kept) == [3, 4, 5, 6, 7]
+    curriculum, _ = with_candidates(config, 8)
+    add(curriculum, make_candidate(config, 100, cell=1), seq=1)
+    assert len(curriculum) == 6
+    assert (seeds_in(curriculum, 0), seeds_in(curriculum, 1)) == ([3, 4, 5, 6, 7], [100])
+    kept = curriculum.database.candidates("")
+    assert [entry.task.seed for entry in kept if isinstance(entry.task, Task)] == [3, 4, 5, 6, 7, 100]
 
 
-def test_samples_are_different_candidates_in_random_order():
-    store, rng = TaskStore(PLUS), np.random.default_rng(0)
-    for seed in range(20):
-        store.add([make_candidate(PLUS, seed)])
+def test_draws_are_different_candidates_in_random_order():
+    curriculum, _ = with_candidates(PLUS, 20)
     first: Counter[int] = Counter()
     for _ in range(400):
-        seeds = [entry.task.seed for entry in store.sample(0, 5, rng)]
+        seeds = [entry.task.seed for entry in curriculum.cells[0].draw(5)]
         assert len(set(seeds)) == 5
         first[seeds[0]] += 1
     assert sum((first[seed] - 20) ** 2 / 20 for seed in range(20)) < 36.19  # 19 degrees of freedom, 1%
 
 
+def test_candidates_without_q_wait_while_others_have_one():
+    curriculum, _ = with_candidates(PLUS, 3)
+    value(curriculum, Learner(PLUS))
+    add(curriculum, *(make_candidate(PLUS, seed) for seed in range(3, 9)), seq=1)
+    proposals = [curriculum.propose(0, 0) for _ in range(9)]
+    assert {task_of(p).seed for p in proposals[:3]} == {0, 1, 2}
+    assert [p.q is None for p in proposals] == [False] * 3 + [True] * 6
+
+
 def test_candidate_of_another_layout_is_refused_naming_the_field():
-    store, good = TaskStore(PLUS), make_candidate(PLUS, 0)
+    curriculum, good = Curriculum(PLUS), make_candidate(PLUS, 0)
     wrong = {
         "visual": (good.visual[:-1], good.visual.astype(np.float32), good.visual[None]),
         "lidar": (good.lidar[:-1], good.lidar.astype(np.float64), np.zeros(256, np.float16)),
@@ -380,65 +470,178 @@ def test_candidate_of_another_layout_is_refused_naming_the_field():
             with pytest.raises(
                 MessageError, match=rf"candidate {name} is .*, expected \(4,\)|expected float16"
             ):
-                store.add([good, good.model_copy(update={name: array})])
-    assert len(store) == 0
-    assert len(store) == 0  # all or none
-    store.add([good])
-    assert len(store) == 1
+                add(curriculum, good, good.model_copy(update={name: array}))
+    assert len(curriculum) == 0, "all or none"
+    add(curriculum, good)
+    assert len(curriculum) == 1
 
 
 # On disk
 
 
-def test_restored_curriculum_goes_on_where_the_saved_one_was(tmp_path):
-    config = gated(window=6, threshold=0.5)
-    saved = Curriculum(config)
-    for i in range(20):
-        saved.report(outcome_of(saved.propose(i % 9, 0), i < 5))
-    saved.gate.add(True)
-    saved.save(tmp_path / "curriculum")
-    saved.save(tmp_path / "curriculum")
-    assert [path.name for path in tmp_path.iterdir()] == ["curriculum"]
-    restored = Curriculum(config.model_copy(update={"seed": 5}))
-    restored.restore(tmp_path / "curriculum")
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "run" / "curriculum.db"
+
+
+def played(config: Config, file: Path, outcomes: int, successes: int) -> Curriculum:
+    """A curriculum that has proposed and heard so much, the successes first."""
+    curriculum = Curriculum(config, Database(file))
+    for i in range(outcomes):
+        curriculum.report(outcome_of(curriculum.propose(i % 9, 0), i < successes), origin(i))
+    return curriculum
+
+
+def test_restored_curriculum_goes_on_where_the_saved_one_was(file):
+    config = gated(window=6, threshold=0.9)
+    saved = played(config, file, outcomes=20, successes=5)
+    saved.save()
+    saved.save()
+    following = [task_of(saved.propose(7, 0)) for _ in range(3)]  # counts from the next save on
+    proposed = saved.proposed - Counter(gate=3)
+    saved.database.close()
+    assert [path.name for path in file.parent.iterdir()] == ["curriculum.db"]
+    restored = Curriculum(config.model_copy(update={"seed": 5}), Database(file))
     assert restored.outcomes == 20
-    assert restored.proposed == saved.proposed
-    assert restored.gate.open is saved.gate.open
-    assert list(restored.gate.outcomes) == list(saved.gate.outcomes)
-    rows = [
-        geometric_properties(t, build_scene(t, config.world))
-        for t in (Task(cell=c, seed=c, start=config.world.start) for c in range(9))
-    ]
-    q: list[float | None] = [None] * 9
-    assert restored.network.predict(rows, q).tolist() == saved.network.predict(rows, q).tolist()
+    assert restored.proposed == proposed == {"gate": 20}
+    assert not restored.gate.open
+    assert list(restored.gate.outcomes) == [False] * 6
+    assert predictions(restored) == predictions(saved)
+    assert network_of(restored).fits == 1
+    assert [task_of(restored.propose(7, 0)) for _ in range(3)] == following
 
 
-def test_gate_that_has_opened_stays_open_after_a_restart(tmp_path):
+@pytest.mark.parametrize("config", [FEW, FEW_LETTER])
+def test_what_came_after_the_last_save_is_learned_again_from_the_outcomes(file, config):
+    killed = played(config, file, outcomes=40, successes=15)
+    killed.database.close()
+    restored = Curriculum(config, Database(file))
+    assert restored.outcomes == 40
+    assert restored.judged == killed.judged
+    assert network_of(restored).fits == 2
+    assert predictions(restored) == predictions(killed) != predictions(Curriculum(config))
+    assert all(restored.seen.seen(origin(seq)) for seq in range(40))
+    assert not restored.seen.seen(origin(40))
+
+
+def test_restored_candidates_keep_their_observations_and_leases_but_not_those_of_another_encoder(file):
+    killed, candidates = with_candidates(PLUS, 4, database=Database(file))
+    taken = killed.propose(0, 0)
+    killed.database.close()
+    restored = Curriculum(PLUS, Database(file))
+    assert seeds_in(restored) == [0, 1, 2, 3]
+    learner = Learner(PLUS)
+    value(restored, learner)
+    free = sorted(set(candidates) - {task_of(taken).seed})
+    found = {task_of(p).seed: p.q for p in (restored.propose(0, 0) for _ in range(3))}
+    assert sorted(found) == free
+    assert [found[seed] for seed in free] == pytest.approx([learner.q(candidates[s]) for s in free], abs=1e-5)
+    restored.report(outcome_of(taken, True), origin(1))
+    assert seeds_in(restored) == free
+    restored.database.close()
+    assert len(Curriculum(PLUS, Database(file), encoder="another")) == 0
+
+
+def test_gate_that_has_opened_stays_open_after_a_restart(file):
     config = gated(window=2)
-    saved = Curriculum(config)
-    for _ in range(2):
-        saved.report(outcome_of(saved.propose(0, 0), True))
-    saved.save(tmp_path)
-    restored = Curriculum(config)
-    restored.restore(tmp_path)
+    saved = played(config, file, outcomes=2, successes=2)
+    saved.save()
+    for i in range(10):
+        assert saved.propose(0, 0).category != "gate"
+        saved.report(Outcome(proposal=None, task=make_candidate(config, i).task, success=False), origin(i))
+    saved.database.close()
+    restored = Curriculum(config, Database(file))
     assert restored.gate.open
     assert restored.propose(0, 0).category != "gate"
 
 
-def test_folder_without_a_state_is_a_beginning(tmp_path):
-    curriculum = Curriculum(PLUS)
-    curriculum.restore(tmp_path / "absent")
-    assert curriculum.outcomes == 0
+def test_file_that_is_not_there_is_a_beginning(file):
+    curriculum = Curriculum(PLUS, Database(file))
+    assert (curriculum.outcomes, len(curriculum)) == (0, 0)
+    assert file.exists()
 
 
-def test_state_of_another_algorithm_or_damaged_is_a_usage_error(tmp_path):
-    Curriculum(PLUS).save(tmp_path / "plus")
-    with pytest.raises(UsageError, match="plus"):
-        Curriculum(LETTER).restore(tmp_path / "plus")
-    for damage in ("{", "{}", "[]", '{"numbers": 3}'):
-        (tmp_path / "plus" / "state.json").write_text(damage)
-        with pytest.raises(UsageError, match="plus"):
-            Curriculum(PLUS).restore(tmp_path / "plus")
+def test_state_of_another_algorithm_is_learned_again_from_the_outcomes_on_record(file, caplog):
+    saved = played(FEW_LETTER, file, outcomes=40, successes=15)
+    results = [outcome.result for outcome in saved.database.outcomes()]
+    saved.save()
+    saved.database.close()
+    other = Curriculum(PLUS, Database(file))
+    assert "another algorithm than before" in caplog.text
+    expected = Curriculum(PLUS)
+    for result in results:
+        network_of(expected).add(result.entry.properties, result.entry.q, result.success)
+    assert other.outcomes == 40
+    assert network_of(other).fits == 2
+    assert predictions(other) == predictions(expected)
+    other.save()
+    other.database.close()
+    rnd = Curriculum(RND, Database(file))
+    assert (rnd.outcomes, rnd.propose(0, 0).category) == (40, "rnd")
+
+
+@pytest.mark.parametrize("damage", ["{", "{}", "[]", "3", "null", '{"numbers": 3}'])
+def test_damaged_state_is_a_usage_error(file, damage):
+    saved = played(FEW, file, outcomes=1, successes=1)
+    saved.save()
+    saved.database.close()
+    with sqlite3.connect(file) as sql:
+        sql.execute("UPDATE states SET text = ?", (damage,))
+    sql.close()
+    with pytest.raises(UsageError, match=r"curriculum\.db"):
+        Curriculum(PLUS, Database(file))
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["kind", "rng", "algorithm", "gate_open", "gate_outcomes", "proposed", "judged", "outcomes", "last"],
+)
+def test_state_that_lacks_something_is_a_usage_error(file, field):
+    saved = played(gated(), file, outcomes=1, successes=1)
+    saved.save()
+    saved.database.close()
+    with sqlite3.connect(file) as sql:
+        sql.execute("UPDATE states SET text = json_remove(text, ?)", (f"$.{field}",))
+    sql.close()
+    with pytest.raises(UsageError, match=r"curriculum\.db does not fit: .*; move it to start afresh"):
+        Curriculum(gated(), Database(file))
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "tensors cut",
+        "tensors gone",
+        "outcome cut",
+        "another schema",
+        "file cut",
+        "pages overwritten",
+        "no database",
+    ],
+)
+def test_damaged_database_is_a_usage_error(file, where):
+    saved = played(FEW, file, outcomes=30, successes=1)
+    saved.save()
+    saved.database.close()
+    content = file.read_bytes()
+    if where == "file cut":
+        file.write_bytes(content[:5000])
+    elif where == "pages overwritten":
+        file.write_bytes(content[:4096] + b"x" * (len(content) - 4096))
+    elif where == "no database":
+        file.write_bytes(b"x" * 5000)
+    else:
+        change = {
+            "tensors cut": "UPDATE states SET tensors = substr(tensors, 1, 99)",
+            "tensors gone": "UPDATE states SET tensors = NULL",
+            "outcome cut": "UPDATE outcomes SET entry = substr(entry, 1, 9), id = id + 99",
+            "another schema": "PRAGMA user_version=99",
+        }
+        with sqlite3.connect(file) as sql:
+            sql.execute(change[where])
+        sql.close()
+    with pytest.raises(UsageError, match=r"curriculum\.db"):
+        Curriculum(PLUS, Database(file))
 
 
 # What the command prints
@@ -446,10 +649,11 @@ def test_state_of_another_algorithm_or_damaged_is_a_usage_error(tmp_path):
 
 def test_proposal_has_the_keys_that_programs_read():
     curriculum, _ = with_candidates(PLUS, 3)
-    curriculum.critic.load(Version(epoch=1), Learner(PLUS).tensors())
+    value(curriculum, Learner(PLUS))
     proposal = curriculum.propose(0, 0)
     fields = json.loads(proposal.model_dump_json())
-    assert {"id", "requested", "category", "q", "q_reason", "f", "mu", "sigma"} <= fields.keys()
+    keys = {"id", "requested", "category", "why", "q", "q_version", "q_reason", "f", "mu", "sigma"}
+    assert keys <= fields.keys()
     assert {"cell", "seed", "start", "shift"} == fields["task"].keys()
     assert fields["task"]["shift"] is None
     assert {"distance", "agent_clearance", "goal_clearance", "relative_angle"} <= fields["properties"].keys()
@@ -464,7 +668,7 @@ def test_proposal_has_the_keys_that_programs_read():
 def test_proposals_follow_the_seed():
     def run(seed: int) -> list[int]:
         curriculum = Curriculum(PLUS.model_copy(update={"seed": seed}))
-        return [curriculum.propose(2, 0).task.seed for _ in range(2)]
+        return [task_of(curriculum.propose(2, 0)).seed for _ in range(2)]
 
     assert run(1) == run(1) != run(2)
 
@@ -472,7 +676,8 @@ def test_proposals_follow_the_seed():
 def test_paper_preset_proposes_by_the_letter_without_a_gate():
     curriculum = Curriculum(resolve("paper"))
     assert curriculum.gate.open
-    assert not curriculum.network.plus
+    assert curriculum.config.curriculum.algorithm == "navacl-q"
+    assert network_of(curriculum).inputs == (*GEOMETRIC[:4], "q")
     proposal = curriculum.propose(0, 0)
     assert proposal.category in ("easy", "frontier", "random")
-    assert proposal.task.start == resolve("paper").world.start, "no narrowed candidates"
+    assert task_of(proposal).start == resolve("paper").world.start, "no narrowed candidates"

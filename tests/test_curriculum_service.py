@@ -1,9 +1,9 @@
 import json
 import os
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from common.encoders import pack_encoder
 from common.errors import RefusedError, UsageError
 from common.messages import (
     Candidates,
+    Origin,
     Outcome,
     Proposal,
     Proposals,
@@ -27,10 +28,12 @@ from common.messages import (
 )
 from common.networks import make_encoder
 from common.weights import pack
+from curriculum.curriculum import Curriculum
+from curriculum.database import Database
 from curriculum.service import CurriculumService
 from deploy.cli.main import app
 from learner.sac import SAC
-from tests.helpers import STORED, deliver, deliver_all, parcel, reason, small_config, wait_until
+from tests.helpers import STORED, deliver, deliver_all, largest_file, parcel, reason, small_config, wait_until
 from tests.test_curriculum import make_candidate
 
 CONFIG = small_config("curriculum.gate.window=4")
@@ -53,8 +56,7 @@ def started(hub: zenoh.Session) -> Iterator[Callable[..., CurriculumService]]:
 
     yield start
     for service in services:
-        with suppress(zenoh.ZError):  # the test has closed it
-            service.close()
+        service.close()
 
 
 def query(client: zenoh.Session, cell: int = 0, count: int = 1, key: str = KEYS.task) -> list[Proposal]:
@@ -62,15 +64,7 @@ def query(client: zenoh.Session, cell: int = 0, count: int = 1, key: str = KEYS.
 
 
 def outcome_of(proposal: Proposal, success: bool = True, digest: dict[str, str] = DIGEST) -> Outcome:
-    return Outcome(
-        digest=digest,
-        proposal=proposal.id,
-        task=proposal.task,
-        properties=proposal.properties,
-        q=proposal.q,
-        success=success,
-        category=proposal.category,
-    )
+    return Outcome(digest=digest, proposal=proposal.id, task=proposal.task, success=success)
 
 
 def test_tasks_are_proposed_without_a_learner(client, started):
@@ -101,8 +95,8 @@ def test_malformed_queries_are_refused_and_the_service_goes_on(client, started, 
             ask_bytes(client, f"{channel}/local/a1", payload)
         assert reason(deliver(client, channel, payload, 0)) not in ("BUSY", INTERNAL_ERROR)
     assert len(query(client, count=2)) == 2
-    assert [sum(server.refused.values()) for server in service._servers] == [1, 2, 2]
-    assert (service.curriculum.outcomes, len(service.curriculum.store)) == (0, 0)
+    assert [sum(server.refused.values()) for server in service._servers] == [1, 0, 0, 2, 2]
+    assert (service.curriculum.outcomes, len(service.curriculum)) == (0, 0)
 
 
 def test_impossible_cell_is_refused_with_the_reason(client, started):
@@ -124,13 +118,14 @@ def test_outcome_is_acknowledged_and_a_duplicate_counts_once(client, started):
     assert list(service.curriculum.gate.outcomes) == [True]
     assert deliver(client, KEYS.result, outcome_of(proposals[1], success=False), 1) == STORED
     assert deliver(client, KEYS.result, outcome_of(proposals[1]), 0, boot="b2") == STORED
-    assert list(service.curriculum.gate.outcomes) == [True, False, True]
+    assert list(service.curriculum.gate.outcomes) == [True, False], "a proposal ends once, whoever says so"
+    assert service.curriculum.outcomes == 2
     assert duplicates(service) == [3, 0]
 
 
 def duplicates(service: CurriculumService) -> list[int]:
     """Of outcomes and of candidates."""
-    return [server.duplicates for server in service._servers[1:]]
+    return [server.duplicates for server in service._servers[3:]]
 
 
 def test_outcomes_that_come_together_are_taken_one_by_one(client, started):
@@ -157,14 +152,23 @@ def test_outcomes_open_the_gate_for_the_next_query(client, started):
     assert query(client)[0].category != "gate"
 
 
+def count(service: CurriculumService, cell: int) -> int:
+    """Candidates of a cell in the database."""
+    return service.curriculum.snapshot().candidates[cell]
+
+
 def test_candidates_are_stored_once_and_proposed(client, started):
     service = started(OPEN)
     message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed, cell=2) for seed in range(4)])
     assert [deliver(client, KEYS.candidates, message, 7) for _ in range(2)] == [STORED, STORED]
     assert duplicates(service) == [0, 1]
-    assert service.curriculum.store.count(2) == 4
-    assert sorted(p.task.seed for p in query(client, cell=2, count=4)) == [0, 1, 2, 3]
-    assert service.curriculum.store.count(2) == 0
+    assert count(service, 2) == 4
+    proposals = query(client, cell=2, count=4)
+    assert sorted(p.task.seed for p in proposals) == [0, 1, 2, 3]
+    assert count(service, 2) == 4
+    for seq, proposal in enumerate(proposals):
+        assert deliver(client, KEYS.result, outcome_of(proposal), seq) == STORED
+        assert count(service, 2) == 3 - seq, "what was reported has left"
 
 
 def test_candidate_of_another_layout_is_refused_and_the_service_goes_on(client, started):
@@ -173,10 +177,10 @@ def test_candidate_of_another_layout_is_refused_and_the_service_goes_on(client, 
     message = Candidates(digest={}, candidates=[make_candidate(other, 0)])
     refused = reason(deliver(client, KEYS.candidates, message, 0))
     assert "candidate visual is float16 (16,), expected float16 (4,)" in refused
-    assert len(service.curriculum.store) == 0
+    assert len(service.curriculum) == 0
     good = Candidates(digest={}, candidates=[make_candidate(OPEN, 0)])
     assert deliver(client, KEYS.candidates, good, 1) == STORED
-    assert len(service.curriculum.store) == 1
+    assert len(service.curriculum) == 1
 
 
 @pytest.mark.parametrize("field", ["protocol", "encoder", "observation", "dynamics", "reward"])
@@ -191,7 +195,7 @@ def test_message_of_a_foreign_contract_is_refused_naming_the_field(client, start
         refused = reason(deliver(client, key, message, 0))
         assert refused.startswith(f"contract differs in '{field}': ")
         assert refused.endswith(" got 0123")
-    assert (service.curriculum.outcomes, len(service.curriculum.store)) == (0, 0)
+    assert (service.curriculum.outcomes, len(service.curriculum)) == (0, 0)
     assert deliver(client, KEYS.result, outcome_of(proposal), 0) == STORED
     assert duplicates(service) == [0, 0], "a refusal uses no number up"
     assert service.curriculum.outcomes == 1
@@ -229,21 +233,59 @@ def test_actors_spool_is_emptied_by_the_service(client, started, tmp_path):
     assert service.curriculum.outcomes == 6
 
 
-def test_restarted_service_remembers_outcomes_and_what_came_before(client, started, tmp_path):
-    first = started(folder=tmp_path / "curriculum")
+def test_restarted_service_remembers_outcomes_and_what_came_before(hub, client, started, tmp_path):
+    first = CurriculumService(hub, "run-1", CONFIG, None, tmp_path / "run")
     for seq, proposal in enumerate(query(client, count=3)):
         assert deliver(client, KEYS.result, outcome_of(proposal), seq) == STORED
     (waiting,) = query(client)
     first.close()
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["curriculum.db"]
     first._token.undeclare()
-    second = started(folder=tmp_path / "curriculum")
+    second = started(folder=tmp_path / "run")
     assert second.curriculum.outcomes == 3
     assert not second.curriculum.gate.open
     assert deliver(client, KEYS.result, outcome_of(waiting), 2) == STORED
     assert duplicates(second) == [1, 0], "its acknowledgement had got lost"
     assert deliver(client, KEYS.result, outcome_of(waiting), 3) == STORED
     assert second.curriculum.outcomes == 4
-    assert second.curriculum.gate.open
+    assert second.curriculum.gate.open, "the proposal of before counts as a favourable start"
+
+
+def test_acknowledged_is_what_survives_a_service_that_is_killed(client, started, tmp_path):
+    started(OPEN, folder=tmp_path)
+    message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed) for seed in range(3)])
+    assert deliver(client, KEYS.candidates, message, 0) == STORED
+    taken, waiting = query(client, count=2)
+    assert deliver(client, KEYS.result, outcome_of(taken), 1) == STORED
+    dead = tmp_path / "dead"
+    dead.mkdir()
+    for suffix in ("", "-wal"):  # as they would be left behind
+        shutil.copy(tmp_path / f"curriculum.db{suffix}", dead)
+    left = Curriculum(OPEN, Database(dead / "curriculum.db"))
+    assert (left.outcomes, len(left), left.snapshot().leases) == (1, 2, 1)
+    left.report(outcome_of(waiting), Origin(actor="local/a1", boot="b1", seq=2))
+    assert (left.outcomes, len(left), left.snapshot().leases) == (2, 1, 0)
+    assert [outcome.result.category for outcome in left.database.outcomes()] == [
+        taken.category,
+        waiting.category,
+    ]
+
+
+def test_tasks_are_given_on_a_full_disk_and_what_could_not_be_kept_is_taken_later(client, started, tmp_path):
+    service = started(folder=tmp_path)
+    proposals = query(client, count=2)
+    with largest_file(1000):
+        assert [p.category for p in query(client, count=3)] == ["gate"] * 3
+        assert reason(deliver(client, KEYS.result, outcome_of(proposals[0]), 0)) == INTERNAL_ERROR
+        assert service._failed_writes == 1
+        assert service.curriculum.outcomes == 0
+        service.save()
+    assert deliver(client, KEYS.result, outcome_of(proposals[0]), 0) == STORED
+    assert (service.curriculum.outcomes, duplicates(service)) == (1, [0, 0])
+    assert list(service.curriculum.gate.outcomes) == [True], "the lease of before is still known"
+    (proposal,) = query(client)
+    assert deliver(client, KEYS.result, outcome_of(proposal), 1) == STORED
+    assert service.curriculum.outcomes == 2
 
 
 def test_second_curriculum_of_a_run_is_refused(started):
@@ -279,6 +321,11 @@ def run_during(service: CurriculumService, action: Callable[[], None]) -> None:
         raise failure
 
 
+def valued_by(service: CurriculumService, version: Version) -> bool:
+    entries = list(service.curriculum.cells[0].entries.values())
+    return bool(entries) and all(entry.q_version == version for entry in entries)
+
+
 def test_q_follows_the_weights_that_the_learner_publishes(hub, client):
     sac, version = SAC(OPEN), Version(epoch=1, counter=5)
     weights = {"blob": encode(pack(version, sac.critic_state()))}
@@ -288,15 +335,15 @@ def test_q_follows_the_weights_that_the_learner_publishes(hub, client):
     def learn() -> None:
         message = Candidates(digest=DIGEST, candidates=[make_candidate(OPEN, seed) for seed in range(2)])
         assert deliver(client, KEYS.candidates, message, 0) == STORED
-        for newer in (version, Version(epoch=2, counter=0)):
+        for seq, newer in enumerate((version, Version(epoch=2, counter=0)), start=1):
             weights["blob"] = encode(pack(newer, sac.critic_state()))
             publish(client, KEYS.version, newer)
-            wait_until(
-                lambda newer=newer: service.curriculum.critic.version == newer, what=f"weights {newer}"
-            )
+            wait_until(lambda newer=newer: valued_by(service, newer), what=f"Q under weights {newer}")
             (proposal,) = query(client)
-            assert proposal.q_reason == "critic"
+            assert (proposal.q_reason, proposal.q_version) == ("critic", f"{newer.epoch}.{newer.counter}")
             assert proposal.q is not None
+            assert deliver(client, KEYS.result, outcome_of(proposal), seq) == STORED
+            assert len(service.curriculum) == 2 - seq
 
     run_during(service, learn)
     service.close()
@@ -311,22 +358,8 @@ def test_command_prints_one_json_object_with_the_keys_that_programs_read(endpoin
     assert answer.keys() == {"tasks"}
     assert len(answer["tasks"]) == 5
     for task in answer["tasks"]:
-        keys = [
-            "id",
-            "cell",
-            "seed",
-            "requested",
-            "category",
-            "properties",
-            "q",
-            "q_reason",
-            "f",
-            "mu",
-            "sigma",
-            "robot",
-            "dolly",
-        ]
-        assert set(keys) <= task.keys()
+        keys = ("id", "cell", "seed", "requested", "category", "why", "properties", "robot", "dolly")
+        assert {*keys, "q", "q_version", "q_reason", "f", "mu", "sigma"} <= task.keys()
         assert task["cell"] == 3
         assert task["q"] is None
         assert "geometry" in task["q_reason"]

@@ -27,13 +27,14 @@ from common.messages import (
     Nothing,
     Outcome,
     Receipt,
+    Scored,
+    ScoreQuery,
     Stat,
     TaskQuery,
     Version,
     decode,
     encode,
 )
-from common.tasks import GeometricProperties
 from curriculum.service import CurriculumService
 from learner.checkpoint import RunDirectory
 from learner.pretraining.frame_store import FrameStore
@@ -93,15 +94,7 @@ def target(tmp_path: Path, hub: zenoh.Session) -> Iterator[Target]:
         mask=np.zeros((shots, size * size // 8), np.uint8),
         goal=np.zeros((shots, 3), np.float32),
     )
-    outcome = Outcome(
-        digest=digest,
-        proposal="p",
-        task=episode.task,
-        properties=GeometricProperties(**dict.fromkeys(GeometricProperties.model_fields, 0.5)),
-        q=0.5,
-        success=True,
-        category="random",
-    )
+    outcome = Outcome(digest=digest, proposal="p", task=episode.task, success=True)
     row = Candidate(task=episode.task, visual=episode.visual[0], lidar=episode.lidar[0])
     stat = Stat(
         **Member("actor", "local", "fuzz")._asdict(),
@@ -126,6 +119,8 @@ def target(tmp_path: Path, hub: zenoh.Session) -> Iterator[Target]:
         "result": of(keys.result, outcome),
         "candidates": of(keys.candidates, Candidates(digest=digest, candidates=[row, row])),
         "task": of(keys.task, TaskQuery(cell=1)),
+        "score": of(keys.score, ScoreQuery(tasks=[Scored(task=episode.task, q=0.5)])),
+        "snapshot": of(keys.snapshot, Nothing()),
         "contract": of(keys.contract, Nothing()),
         "weights": of(keys.weights("policy"), Nothing()),
         "version": told(keys.version, Version(epoch=1, counter=1), heard),
@@ -139,7 +134,7 @@ def target(tmp_path: Path, hub: zenoh.Session) -> Iterator[Target]:
             log.episodes,
             drives_.drives,
             state.outcomes,
-            len(state.store),
+            len(state),
             len(versions),
             len(members.stats),
         )
@@ -286,6 +281,8 @@ CHANNELS = (
     "result",
     "candidates",
     "task",
+    "score",
+    "snapshot",
     "contract",
     "weights",
     "version",

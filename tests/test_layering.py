@@ -49,6 +49,22 @@ def test_common_is_seen_to_import_itself_only():
     assert ours == {"common"}
 
 
+def test_algorithms_of_the_curriculum_know_neither_files_nor_the_bus():
+    files = sorted((ROOT / "curriculum" / "algorithms").glob("*.py"))
+    assert len(files) > 5
+    modules = {
+        node.module
+        for path in files
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom)
+    }
+    forbidden = {"curriculum.database", "curriculum.service", "curriculum.curriculum", "pathlib"}
+    forbidden |= {f"common.{name}" for name in ("bus", "delivery", "files", "link")}
+    assert "curriculum.success_network" in modules
+    assert not modules & forbidden
+    assert not {"os", "sqlite3", "zenoh"} & {name for path in files for name in imported(path.read_text())}
+
+
 @pytest.mark.parametrize("room", ROOMS)
 def test_dependencies_run_one_way(room):
     files = sorted((ROOT / room).rglob("*.py"))

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from common import messages as m
-from common.config import Config, resolve
+from common.config import GEOMETRIC, Config, resolve
 from common.messages import MessageError, _to_array, decode, encode
 from common.observation import ObservationLayout
 from common.tasks import (
     FIRST_SUITE_SEED,
     DollyShift,
-    GeometricProperties,
     PlacedStart,
     Task,
     suite,
@@ -41,7 +40,8 @@ tasks = st.builds(
     | st.builds(PlacedStart, x=st.floats(-20, 20), y=st.floats(-20, 20), yaw=st.floats(-180, 180)),
     shift=st.none() | st.builds(DollyShift, step=st.integers(1, 10_000), x=st.floats(-10, 10)),
 )
-properties = st.builds(GeometricProperties, **dict.fromkeys(GeometricProperties.model_fields, numbers))
+properties = st.dictionaries(names, numbers, max_size=32)
+any_tasks = tasks | st.dictionaries(names, numbers, min_size=1, max_size=32)
 arrays = st.sampled_from([np.float16, np.float32, np.float64, np.uint8]).flatmap(
     lambda dtype: hnp.arrays(
         dtype,
@@ -54,17 +54,22 @@ versions = st.builds(m.Version, epoch=counts, counter=counts)
 proposals = st.builds(
     m.Proposal,
     id=names,
-    task=tasks,
+    task=any_tasks,
     requested=st.sampled_from(["easy", "frontier", "random"]),
     category=categories,
+    why=texts,
     properties=properties,
     q=st.none() | numbers,
+    q_version=st.none() | texts,
     q_reason=texts,
     f=st.none() | numbers,
     mu=st.none() | numbers,
     sigma=st.none() | numbers,
-    robot=poses,
-    dolly=poses,
+    robot=st.none() | poses,
+    dolly=st.none() | poses,
+)
+scored = st.builds(
+    m.Scored, task=st.none() | any_tasks, properties=st.none() | properties, q=st.none() | numbers
 )
 candidates = st.builds(m.Candidate, task=tasks, visual=arrays, lidar=arrays)
 MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
@@ -90,12 +95,27 @@ MESSAGES: dict[type[m.Message], st.SearchStrategy] = {
     m.Outcome: st.builds(
         m.Outcome,
         digest=digests,
-        proposal=names,
-        task=tasks,
-        properties=properties,
-        q=st.none() | numbers,
+        proposal=st.none() | names,
+        task=any_tasks,
         success=st.booleans(),
-        category=categories,
+    ),
+    m.Scored: scored,
+    m.ScoreQuery: st.builds(m.ScoreQuery, tasks=st.lists(scored, min_size=1, max_size=3)),
+    m.Scores: st.builds(
+        m.Scores, f=st.lists(numbers), properties=st.lists(properties, max_size=3), outcomes=counts
+    ),
+    m.Snapshot: st.builds(
+        m.Snapshot,
+        algorithm=texts,
+        outcomes=counts,
+        candidates=st.lists(counts, max_size=9),
+        leases=counts,
+        gate_open=st.booleans(),
+        proposed=st.dictionaries(texts, counts),
+        inputs=st.lists(texts),
+        brier=st.none() | numbers,
+        reliability=st.lists(st.tuples(numbers, numbers, counts), max_size=10),
+        network=st.binary(),
     ),
     m.Candidate: candidates,
     m.Candidates: st.builds(m.Candidates, digest=digests, candidates=st.lists(candidates, max_size=3)),
@@ -224,6 +244,10 @@ def test_anything_but_version_type_fields_is_refused(outer):
         decode(m.Nothing, msgpack.packb(outer))
 
 
+BOX = {"proposal": None, "task": {"mass": 1.0}, "success": True}
+"""An outcome of somebody else's environment."""
+
+
 @pytest.mark.parametrize("fields", [None, 1, "x", [], [1, 2], b"", True])
 def test_fields_that_are_no_mapping_are_refused(fields):
     with pytest.raises(MessageError, match=r"^TaskQuery\.: "):
@@ -266,6 +290,22 @@ def test_fields_that_are_no_mapping_are_refused(fields):
         (m.Receipt, {"answers": [""] * (m.BUNDLE + 1)}, r"Receipt\.answers"),
         (m.Receipt, {"answers": ["x" * 401]}, r"Receipt\.answers\.0"),
         (m.Receipt, {"answers": [None]}, r"Receipt\.answers\.0"),
+        (m.Outcome, {"proposal": None, "success": True}, r"Outcome\.task: Field required"),
+        (m.Outcome, BOX | {"task": {}}, r"Outcome\.task"),
+        (m.Outcome, BOX | {"task": {f"p{i}": 0.0 for i in range(33)}}, r"Outcome\.task"),
+        (m.Outcome, BOX | {"task": {"mass": float("nan")}}, r"Outcome\.task"),
+        (m.Outcome, BOX | {"task": {"mass": "heavy"}}, r"Outcome\.task"),
+        (m.Outcome, BOX | {"task": {"m/s": 1.0}}, r"Outcome\.task"),
+        (m.Outcome, BOX | {"proposal": ""}, r"Outcome\.proposal"),
+        (m.Outcome, BOX | {"q": 0.5}, r"Outcome\.q: Extra inputs are not permitted"),
+        (m.ScoreQuery, {"tasks": []}, r"ScoreQuery\.tasks: "),
+        (m.ScoreQuery, {"tasks": [{}] * 1001}, r"ScoreQuery\.tasks: "),
+        (m.ScoreQuery, {"tasks": [{"q": float("inf")}]}, r"ScoreQuery\.tasks\.0\.q: "),
+        (
+            m.ScoreQuery,
+            {"tasks": [{"properties": {"mass": None}}]},
+            r"ScoreQuery\.tasks\.0\.properties\.mass: ",
+        ),
         (m.Candidates, {"digest": {str(i): "" for i in range(17)}, "candidates": []}, r"Candidates\.digest"),
     ],
 )
@@ -279,15 +319,7 @@ def test_task_in_an_arena_is_refused_wherever_a_message_holds_one(cell):
     proposal, episode = sample_proposals().tasks[0], fields_of(tiny_episode(CONFIG))
     arena = Task(cell=cell, seed=77, start=StartRanges()).model_dump()
     candidate = {"task": arena, "visual": episode["visual"], "lidar": episode["lidar"]}
-    outcome = m.Outcome(
-        digest={},
-        proposal="p-1",
-        task=proposal.task,
-        properties=proposal.properties,
-        q=None,
-        success=True,
-        category="easy",
-    )
+    outcome = m.Outcome(proposal="p-1", task=proposal.task, success=True)
     said = f"cell {cell} is an arena, where nothing is trained"
     for kind, fields, place in (
         (m.Episode, {**episode, "task": arena}, "Episode.task"),
@@ -323,9 +355,8 @@ def test_task_in_an_arena_does_not_even_leave():
 def test_impossible_task_is_refused_by_its_field(change, said):
     proposal = sample_proposals().tasks[0]
     task = {**proposal.task.model_dump(), **change}
-    fields = {"digest": {}, "proposal": "p", "task": task, "properties": proposal.properties.model_dump()}
     with pytest.raises(MessageError, match=said):
-        decode(m.Outcome, packed(m.Outcome, {**fields, "q": None, "success": True, "category": "easy"}))
+        decode(m.Outcome, packed(m.Outcome, {"proposal": "p", "task": task, "success": True}))
 
 
 @pytest.mark.parametrize(
@@ -385,9 +416,11 @@ def test_a_full_answer_to_the_largest_question_fits():
         ),
         requested="frontier",
         category="unserved",
-        properties=GeometricProperties(**dict.fromkeys(GeometricProperties.model_fields, 0.1)),
+        why="frontier: among the ten of 1000 whose outcome is least certain; predicted success 0.50",
+        properties=dict.fromkeys(GEOMETRIC, 0.1),
         q=0.1,
-        q_reason="no weights of the critic yet",
+        q_version="1234567890.1234567890",
+        q_reason="no candidate in the database; by geometry alone",
         f=0.1,
         mu=0.1,
         sigma=0.1,
@@ -483,8 +516,10 @@ def sample_proposals() -> m.Proposals:
         task=Task(cell=2, seed=77, start=StartRanges()),
         requested="easy",
         category="easy",
-        properties=GeometricProperties(**dict.fromkeys(GeometricProperties.model_fields, 0.5)),
+        why="easy: the first of 100 that is likely enough; predicted success 0.25",
+        properties=dict.fromkeys(GEOMETRIC, 0.5),
         q=1.5,
+        q_version="1.7",
         q_reason="",
         f=0.25,
         mu=None,

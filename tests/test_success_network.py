@@ -6,13 +6,17 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from common.config import resolve
-from common.tasks import GeometricProperties
+from common.config import GEOMETRIC, CurriculumConfig, resolve
 from curriculum.success_network import SuccessNetwork
+from curriculum.task_space import DOCKING_SCALES
 
 PAPER = resolve("paper").curriculum
 PLUS = resolve("fast").curriculum
-Row = tuple[GeometricProperties, float | None, bool]
+Row = tuple[dict[str, float], float | None, bool]
+
+
+def make_network(config: CurriculumConfig, seed: int = 0) -> SuccessNetwork:
+    return SuccessNetwork(config, config.inputs, DOCKING_SCALES, seed)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -23,15 +27,10 @@ def _one_thread():
     torch.set_num_threads(threads)
 
 
-def random_properties(rng: np.random.Generator) -> GeometricProperties:
-    return GeometricProperties(
-        distance=rng.uniform(1.5, 5),
-        agent_clearance=rng.uniform(1, 5),
-        goal_clearance=rng.uniform(1, 5),
-        relative_angle=rng.uniform(0, math.pi / 2),
-        lateral_offset=rng.uniform(0, 1.5),
-        approach_angle=rng.uniform(0, math.pi / 6),
-    )
+def random_properties(rng: np.random.Generator) -> dict[str, float]:
+    """All that are known of a task, whether the network sees them or not."""
+    values = rng.uniform((1.5, 1, 1, 0, 0, 0), (5, 5, 5, math.pi / 2, 1.5, math.pi / 6))
+    return dict(zip(GEOMETRIC, values.tolist(), strict=True))
 
 
 def random_rows(count: int, seed: int = 0, missing: bool = False) -> list[Row]:
@@ -52,10 +51,10 @@ def inputs(rows: list[Row], q: list[float]) -> torch.Tensor:
     return torch.tensor(
         [
             [
-                (p.distance - 3.25) / 1.75,
-                (p.agent_clearance - 3) / 2,
-                (p.goal_clearance - 3) / 2,
-                (p.relative_angle - math.pi / 4) / (math.pi / 4),
+                (p["distance"] - 3.25) / 1.75,
+                (p["agent_clearance"] - 3) / 2,
+                (p["goal_clearance"] - 3) / 2,
+                (p["relative_angle"] - math.pi / 4) / (math.pi / 4),
                 value,
             ]
             for (p, _, _), value in zip(rows, q, strict=True)
@@ -89,13 +88,13 @@ def assert_same_weights(network: SuccessNetwork, net: nn.Sequential) -> None:
 
 @pytest.mark.parametrize(("config", "size"), [(PAPER, 5), (PLUS, 7)])
 def test_network_has_two_hidden_layers_of_32_with_relu(config, size):
-    net = SuccessNetwork(config, 0).net
+    net = make_network(config, 0).net
     shapes = [(m.in_features, m.out_features) if isinstance(m, nn.Linear) else type(m) for m in net]
     assert shapes == [(size, 32), nn.ReLU, (32, 32), nn.ReLU, (32, 1)]
 
 
 def test_paper_takes_one_adam_step_per_16_outcomes_on_exactly_the_fresh_ones():
-    network = SuccessNetwork(PAPER, 0)
+    network = make_network(PAPER, 0)
     net, optimizer = twin_of(network)
     low, high = math.inf, -math.inf
     for seed in range(3):
@@ -112,7 +111,7 @@ def test_paper_takes_one_adam_step_per_16_outcomes_on_exactly_the_fresh_ones():
 
 
 def test_prediction_is_the_sigmoid_of_the_network_with_q_at_the_ends_of_its_range():
-    network = SuccessNetwork(PAPER, 0)
+    network = make_network(PAPER, 0)
     rows = random_rows(16)
     for p, _, success in rows:
         network.add(p, 2.0 if success else -4.0, success)
@@ -125,7 +124,7 @@ def test_prediction_is_the_sigmoid_of_the_network_with_q_at_the_ends_of_its_rang
 
 
 def test_missing_q_is_predicted_at_the_running_mean_of_q():
-    network = SuccessNetwork(PAPER, 0)
+    network = make_network(PAPER, 0)
     rows = random_rows(10)
     mean = rows[0][1]
     for p, q, success in rows:
@@ -141,7 +140,7 @@ def test_missing_q_is_predicted_at_the_running_mean_of_q():
 
 
 def test_running_mean_of_q_lies_within_the_range_of_q_from_the_first_on():
-    network = SuccessNetwork(PAPER, 0)
+    network = make_network(PAPER, 0)
     for q in (-5.0, -4.0):
         network.add(random_rows(1)[0][0], q, False)
     p = [random_rows(1)[0][0]]
@@ -152,7 +151,7 @@ def test_running_mean_of_q_lies_within_the_range_of_q_from_the_first_on():
 
 
 def test_fit_leaves_out_the_outcomes_without_q_when_some_have_one():
-    network = SuccessNetwork(PAPER, 0)
+    network = make_network(PAPER, 0)
     net, optimizer = twin_of(network)
     rows = random_rows(16, missing=True)
     for row in rows:
@@ -166,7 +165,7 @@ def test_fit_leaves_out_the_outcomes_without_q_when_some_have_one():
 
 
 def test_fit_without_any_q_takes_all_at_the_mean():
-    network = SuccessNetwork(PAPER, 0)
+    network = make_network(PAPER, 0)
     net, optimizer = twin_of(network)
     rows = [(p, None, success) for p, _, success in random_rows(16)]
     for row in rows:
@@ -177,7 +176,7 @@ def test_fit_without_any_q_takes_all_at_the_mean():
 
 def test_plus_fits_several_steps_from_all_that_its_reservoir_holds():
     config = PLUS.model_copy(update={"fit_steps": 3, "reservoir": 20})
-    network = SuccessNetwork(config, 0)
+    network = make_network(config, 0)
     for row in random_rows(48):
         network.add(*row)
     assert network.fits == 3
@@ -187,22 +186,48 @@ def test_plus_fits_several_steps_from_all_that_its_reservoir_holds():
 
 
 def test_plus_learns_a_separable_problem():
-    rng, network = np.random.default_rng(0), SuccessNetwork(PLUS, 0)
+    rng, network = np.random.default_rng(0), make_network(PLUS, 0)
     for _ in range(480):
         p = random_properties(rng)
-        network.add(p, float(rng.normal()), p.lateral_offset < 0.75)
+        network.add(p, float(rng.normal()), p["lateral_offset"] < 0.75)
     unseen = [random_properties(rng) for _ in range(500)]
     f = network.predict(unseen, [0.0] * 500)
-    truth = np.array([p.lateral_offset < 0.75 for p in unseen])
+    truth = np.array([p["lateral_offset"] < 0.75 for p in unseen])
     assert ((f > 0.5) == truth).mean() > 0.95
     assert f[truth].mean() > 0.85
     assert f[~truth].mean() < 0.15
     assert network.loss < 0.2
 
 
+def test_network_sees_the_inputs_it_is_given_whatever_their_names():
+    scales = {"wind": (10.0, 10.0), "mass": (2.0, 1.0)}
+    network = SuccessNetwork(PAPER, ("mass", "wind"), scales, 0)
+    with torch.no_grad():
+        expected = torch.sigmoid(network.net(torch.tensor([[-1.0, 0.5], [1.0, -1.0]]))).squeeze(-1).numpy()
+    tasks = [{"wind": 15.0, "mass": 1.0}, {"wind": 0.0, "mass": 3.0, "other": 7.0}]
+    np.testing.assert_allclose(network.predict(tasks, [None, 4.0]), expected, rtol=1e-6)
+    with pytest.raises(KeyError, match="wind"):
+        network.predict([{"mass": 1.0}], [None])
+
+
+@pytest.mark.parametrize("q", [[], ["q"]])
+def test_network_without_q_is_blind_to_it_and_one_of_q_alone_to_all_else(q):
+    inputs = tuple(q) or GEOMETRIC
+    config = PLUS.model_copy(update={"inputs": inputs})
+    network, rng = make_network(config), np.random.default_rng(1)
+    for row in random_rows(64):
+        network.add(*row)
+    assert network.net[0].in_features == len(inputs)
+    tasks = [random_properties(rng) for _ in range(6)]
+    by_q = network.predict(tasks[:1] * 6, [-4.0, -2.0, 0.0, 2.0, 4.0, 6.0])
+    by_geometry = network.predict(tasks, [1.0] * 6)
+    seen, unseen = (by_q, by_geometry) if q else (by_geometry, by_q)
+    assert len(set(unseen.tolist())) == 1 < len(set(seen.tolist()))
+
+
 def test_both_learn_that_a_high_q_means_success():
     for config, count in ((PLUS, 480), (PAPER.model_copy(update={"learning_rate": 4e-3}), 4800)):
-        rng, network = np.random.default_rng(0), SuccessNetwork(config, 0)
+        rng, network = np.random.default_rng(0), make_network(config, 0)
         for _ in range(count):
             q = float(rng.uniform(-10, 10))
             network.add(random_properties(rng), q, q > 0)
@@ -214,7 +239,7 @@ def test_both_learn_that_a_high_q_means_success():
 def test_network_starts_from_its_seed_and_leaves_the_global_generator_alone():
     torch.manual_seed(3)
     before = torch.random.get_rng_state()
-    a, b, c = (SuccessNetwork(PAPER, seed).net[0].weight for seed in (1, 1, 2))
+    a, b, c = (make_network(PAPER, seed).net[0].weight for seed in (1, 1, 2))
     assert torch.equal(torch.random.get_rng_state(), before)
     assert torch.equal(a, b)
     assert not torch.equal(a, c)
@@ -222,7 +247,7 @@ def test_network_starts_from_its_seed_and_leaves_the_global_generator_alone():
 
 @pytest.mark.parametrize("config", [PAPER, PLUS])
 def test_restored_network_predicts_to_the_bit_what_the_saved_one_did(config):
-    saved, restored = SuccessNetwork(config, 0), SuccessNetwork(config, 9)
+    saved, restored = make_network(config, 0), make_network(config, 9)
     for row in random_rows(40, missing=True):
         saved.add(*row)
     restored.restore(*saved.state())
@@ -234,7 +259,7 @@ def test_restored_network_predicts_to_the_bit_what_the_saved_one_did(config):
 
 
 def test_restored_network_learns_on_to_the_bit_as_the_saved_one():
-    saved, restored = SuccessNetwork(PAPER, 0), SuccessNetwork(PAPER, 9)
+    saved, restored = make_network(PAPER, 0), make_network(PAPER, 9)
     for row in random_rows(40):  # two fits, and eight fresh outcomes on the way to the third
         saved.add(*row)
     restored.restore(*saved.state())
@@ -247,12 +272,12 @@ def test_restored_network_learns_on_to_the_bit_as_the_saved_one():
 
 
 def test_state_before_the_first_outcome_can_be_restored():
-    restored = SuccessNetwork(PAPER, 9)
-    restored.restore(*SuccessNetwork(PAPER, 0).state())
+    restored = make_network(PAPER, 9)
+    restored.restore(*make_network(PAPER, 0).state())
     assert restored.fits == 0
     assert [restored.add(*row) for row in random_rows(16)][-1]
 
 
 def test_state_of_the_other_algorithm_is_refused():
     with pytest.raises(ValueError, match=r"size mismatch for 0\.weight"):
-        SuccessNetwork(PAPER, 0).restore(*SuccessNetwork(PLUS, 0).state())
+        make_network(PAPER, 0).restore(*make_network(PLUS, 0).state())

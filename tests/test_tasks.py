@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from shapely import Polygon, prepare, union_all
 
 from common.cells import CELLS, ROOMS, Box
-from common.config import Config, FavourableRanges, resolve
+from common.config import GEOMETRIC, Config, FavourableRanges, resolve
 from common.errors import UsageError
 from common.geometry import SE2, Rectangle, bearing, rectangles_overlap
 from common.tasks import (
@@ -34,6 +34,7 @@ from common.tasks import (
     suite,
 )
 from common.world_config import ObstacleConfig, StartRanges
+from curriculum.task_space import DOCKING_SCALES, make_space
 from tests.helpers import in_frame, polygon, strip
 
 CONFIG = Config()
@@ -757,13 +758,12 @@ def test_relative_angle_is_unsigned_up_to_half_a_turn():
     assert behind.relative_angle == pytest.approx(math.pi)
 
 
-def test_properties_have_the_papers_four_first():
-    assert list(GeometricProperties.model_fields)[:4] == [
-        "distance",
-        "agent_clearance",
-        "goal_clearance",
-        "relative_angle",
-    ]
+def test_properties_have_the_papers_four_first_and_the_configuration_names_them_all():
+    names = tuple(GeometricProperties.model_fields)
+    assert names[:4] == ("distance", "agent_clearance", "goal_clearance", "relative_angle")
+    assert names == GEOMETRIC
+    task = Task(cell=3, seed=7, start=StartRanges())
+    assert tuple(make_space(CONFIG).entry(task).properties) == GEOMETRIC == tuple(DOCKING_SCALES)
 
 
 def test_suites_have_their_sizes_cells_and_ranges():

@@ -32,16 +32,17 @@ from isal.isal_zlib import crc32
 from common.access import LOCAL
 from common.bus import Member, ask_bytes, ask_later
 from common.config import Config, override
-from common.contract import digest, fetch_contract
+from common.contract import digest
 from common.delivery import Parcel, Sender, Spool, pack_bundle
 from common.errors import NoAnswerError, RefusedError, RunError
 from common.link import make_link, open_client
 from common.messages import Episode, Origin, Receipt, decode, encode
 from common.observation import Columns, ObservationLayout
-from deploy.bench.bus_peers import CONFIG, DURABILITIES, EPISODE, PATIENCE, RUN, channel, make_take
+from deploy.bench.bus_peers import CONFIG, DURABILITIES, EPISODE, RUN, channel, make_take
+from deploy.bench.processes import PATIENCE, running_learner
 from deploy.bench.replay import synthetic_episode
 from deploy.bench.report import Report
-from deploy.launcher import Child, free_port
+from deploy.launcher import free_port
 from learner.learner import Learner
 from learner.log import EpisodeLog
 
@@ -376,7 +377,8 @@ def _load(
     limits, loads, limits_cpu, loads_cpu = (list[float]() for _ in range(4))
     with ExitStack() as stack:
         note("the learner starts")
-        process, ours = stack.enter_context(_learner(folder, endpoint))
+        process, contract = stack.enter_context(running_learner(folder / RUN, folder / CONFIG, endpoint))
+        ours = contract.digest
         payload = encode(_episode(config, SIZES["64k"], ours))
         (folder / EPISODE).write_bytes(payload)
         ingest = _ingest(config, ours, payload, folder / "limit")
@@ -448,30 +450,6 @@ def _shares(actors: int) -> list[tuple[int, int]]:
     """First number and count of the actors of each process."""
     edges = np.linspace(0, actors, min(actors, PROCESSES) + 1).astype(int).tolist()
     return [(first, last - first) for first, last in pairwise(edges)]
-
-
-@contextmanager
-def _learner(folder: Path, endpoint: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Process id of a learner with the configuration of the folder, and the digest of its contract."""
-    begin = ["learner", "--run", str(folder / RUN), "--config", str(folder / CONFIG), "--listen", endpoint]
-    child = Child("learner", lambda: begin, folder / "learner.log")
-
-    def look(waited: float) -> None:
-        if not child.alive or waited > PATIENCE:
-            raise RunError(f"the learner does not start: {child.last_words()}")
-
-    child.start()
-    assert child.process is not None
-    try:
-        with open_client(make_link(endpoint), look) as session:
-            ours = fetch_contract(session, look).digest
-        yield child.process.pid, ours
-        child.process.terminate()
-        if child.process.wait(PATIENCE):
-            raise RunError(f"the learner failed: {child.last_words()}")
-    finally:
-        child.process.kill()
-        child.process.wait()
 
 
 def _resident(process: int) -> float:

@@ -25,6 +25,7 @@ from common.link import make_link, open_client, open_hub
 from common.messages import Episode, decode
 from common.observation import ObservationLayout
 from common.telemetry import Quantiles
+from deploy.bench.processes import PATIENCE
 from deploy.launcher import free_port
 from learner.log import EpisodeLog
 
@@ -34,8 +35,6 @@ RUN = "load"
 """Name of the run whose learner is loaded."""
 SPOOLED = 4
 """Episodes that an actor may have waiting."""
-PATIENCE = 60.0
-"""Seconds after which something is broken."""
 Take = Callable[[Parcel], Episode]
 
 

@@ -40,6 +40,22 @@ def bus(
 
 
 @app.command()
+def curriculum(
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; about 3 s each.")] = 10,
+    actors: Annotated[int, typer.Option(min=1, max=1024, help="Actors that ask in the third window.")] = 64,
+    seed: options.Seed = None,
+    as_json: options.Json = False,
+) -> None:
+    """How long a task takes beside a learner that updates, against a bare query; with many actors."""
+    resolved = options.configuration("fast", None, None, None, seed)
+    from deploy.bench.curriculum import bench_curriculum
+
+    with options.progress("rounds", rounds) as done:
+        report = bench_curriculum(resolved, rounds, actors, done)
+    _print(report, as_json)
+
+
+@app.command()
 def encoder(
     frames: Annotated[Path, typer.Option(help="Folder of frames that `navaclq pretrain` has gathered.")],
     epochs: Annotated[int, typer.Option(min=1, help="Epochs for each size.")] = 4,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import ValidationError
 from rich.console import Console
 from rich.table import Table
 
@@ -15,7 +18,8 @@ from common.bus import Keys, ask
 from common.cells import check_cell
 from common.errors import UsageError
 from common.link import Link, open_client, open_hub
-from common.messages import Proposals, TaskQuery
+from common.messages import Nothing, Proposals, ScoreQuery, Scores, Snapshot, TaskQuery
+from common.tasks import Task
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
 from deploy.cli.processes import say_waiting
@@ -37,7 +41,7 @@ def serve_curriculum(
     connect: Annotated[str | None, typer.Option(help="Endpoint of a learner to join.")] = None,
     listen: Annotated[str | None, typer.Option(help="Endpoint to listen on, standing alone.")] = None,
     run: Annotated[
-        Path | None, typer.Option(help="Run directory; the state is kept in its folder curriculum/.")
+        Path | None, typer.Option(help="Run directory; everything is kept in its curriculum.db.")
     ] = None,
     preset: options.Preset = None,
     variant: options.Variant = None,
@@ -55,10 +59,9 @@ def serve_curriculum(
         raise UsageError("--connect and --listen exclude each other: join a learner, or stand alone")
     if connect and any((preset, variant, config, seed is not None)):
         raise UsageError("beside a learner the configuration is the learner's; only --set may differ from it")
-    known = run is None or (run / "run.json").exists() or (run / "curriculum").exists()
-    if run and not known and run.exists() and any(run.iterdir()):
+    known = run is None or (run / "run.json").exists() or (run / "curriculum.db").exists()
+    if run and not known and run.exists() and (not run.is_dir() or any(run.iterdir())):
         raise UsageError(f"{run} is not empty and no run directory; choose another --run")
-    folder = run / "curriculum" if run else None
     start_logging()
     exit_on_signals()
     if connect:
@@ -66,7 +69,7 @@ def serve_curriculum(
         with open_client(link, say_waiting(f"the hub at {link}")) as session:
             contract = fetch_contract(session, say_waiting("a learner at the hub"))
             resolved = accept_contract(contract, tuple(settings or ()))
-            service = CurriculumService(session, contract.run, resolved, contract.digest, folder, link.group)
+            service = CurriculumService(session, contract.run, resolved, contract.digest, run, link.group)
             _serve(service, link)
     else:
         link = options.make_link(listen or options.DEFAULT_ENDPOINT, certs, insecure)
@@ -75,7 +78,7 @@ def serve_curriculum(
         resolved = options.configuration(preset, variant, config, settings, seed)
         with open_hub(link) as session:
             name = run.resolve().name if run else "standalone"
-            _serve(CurriculumService(session, name, resolved, None, folder, link.group), link)
+            _serve(CurriculumService(session, name, resolved, None, run, link.group), link)
 
 
 def _serve(service: CurriculumService, link: Link) -> None:
@@ -103,13 +106,135 @@ def query(
         question = TaskQuery(cell=cell, t=t, count=count)
         answer = ask(session, Keys("*").task, question, Proposals, timeout, patience=timeout)
     if as_json:
-        tasks = [{**p.task.model_dump(), **p.model_dump(exclude={"task"})} for p in answer.tasks]
-        options.print_json({"tasks": tasks})
+        tasks = [p.model_dump() for p in answer.tasks]
+        options.print_json({"tasks": [{**task.pop("task"), **task} for task in tasks]})
         return
-    table = Table("cell", "seed", "requested", "category", "distance m", "angle deg", "Q", "f", "mu", "sigma")
+    table = Table("task", "requested", "category", "distance m", "angle deg", "Q", "f", "mu", "sigma")
     for p in answer.tasks:
         numbers = ["-" if v is None else f"{v:.3f}" for v in (p.q, p.f, p.mu, p.sigma)]
-        angle = math.degrees(p.properties.relative_angle)
-        place = (str(p.task.cell), str(p.task.seed), p.requested, p.category)
-        table.add_row(*place, f"{p.properties.distance:.2f}", f"{angle:.1f}", *numbers)
+        distance, angle = (p.properties.get(name, math.nan) for name in ("distance", "relative_angle"))
+        row = (_name(p.task), p.requested, p.category, f"{distance:.2f}", f"{math.degrees(angle):.1f}")
+        table.add_row(*row, *numbers)
+    Console().print(table)
+    for number, p in enumerate(answer.tasks, 1):
+        Console().print(f"{number}: {p.why}")
+
+
+def _name(task: Task | dict[str, float]) -> str:
+    if isinstance(task, Task):
+        return f"cell {task.cell}, seed {task.seed}"
+    return ", ".join(f"{name} {value:.3g}" for name, value in task.items())
+
+
+@app.command()
+def score(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="JSON list of tasks {cell, seed, start}, or of {properties: {...}, q}.", metavar="TASKS"
+        ),
+    ],
+    connect: options.Connect = options.DEFAULT_ENDPOINT,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait.")] = 10.0,
+    certs: options.Certs = None,
+    as_json: options.Json = False,
+    insecure: options.Insecure = False,
+) -> None:
+    """Ask a running curriculum how likely the present policy is to solve tasks, seen or not."""
+    question = _read_tasks(file)
+    with open_client(options.make_link(connect, certs, insecure), patience=timeout) as session:
+        answer = ask(session, Keys("*").score, question, Scores, timeout, patience=timeout)
+    if as_json:
+        options.print_json(answer.model_dump())
+        return
+    table = Table("f", *answer.properties[0], title=f"f_pi after {answer.outcomes} outcomes; m and rad")
+    for f, properties in zip(answer.f, answer.properties, strict=True):
+        table.add_row(f"{f:.3f}", *(f"{value:.3f}" for value in properties.values()))
+    Console().print(table)
+
+
+def _read_tasks(file: Path) -> ScoreQuery:
+    try:
+        content = json.loads(file.read_text("utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror}") from None
+    except ValueError as error:
+        raise UsageError(f"{file} is not JSON: {error}") from None
+    content = content.get("tasks") if isinstance(content, dict) else content
+    if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
+        raise UsageError(
+            f'{file}: a list of tasks is expected, or {{"tasks": [...]}} as `query --json` prints'
+        )
+    try:
+        return ScoreQuery.model_validate({"tasks": [_scored(item) for item in content]})
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise UsageError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def _scored(item: dict[str, Any]) -> dict[str, Any]:
+    """What is to be scored of a task, of one of `query --json`, or of properties."""
+    if "cell" in item:
+        return {"task": {key: item[key] for key in item if key in Task.model_fields}}
+    if "properties" in item:
+        return {key: item[key] for key in ("properties", "q") if key in item}
+    return {"task": item}
+
+
+@app.command()
+def plot(
+    run: Annotated[Path, typer.Argument(help="Run directory with a curriculum.db.", metavar="RUN")],
+    rival: Annotated[Path | None, typer.Option(help="Run whose tasks are shown beside.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the pictures; default RUN/plots.")] = None,
+    formats: Annotated[str, typer.Option("--format", help="png, svg or both.")] = "png,svg",
+) -> None:
+    """Draw f_pi, the tasks proposed, their mix and the reliability of predictions, also during a run."""
+    from curriculum.plots import draw, read, render
+
+    kinds = formats.split(",")
+    if not set(kinds) <= {"png", "svg"}:
+        raise UsageError(f"--format {formats!r} must be png, svg or png,svg")
+    figures, left_out = draw(read(run), read(rival) if rival else None)
+    folder = out or run / "plots"
+    if figures:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"cannot make {folder}: {error.strerror}") from None
+    for name, figure in figures.items():
+        for kind in kinds:
+            file = folder / f"{name}.{kind}"
+            options.write_file(file, render(figure, kind))
+            sys.stdout.write(f"{file}\n")
+    for name, why in left_out.items():
+        sys.stderr.write(f"left out {name}: {why}\n")
+
+
+@app.command()
+def snapshot(
+    connect: options.Connect = options.DEFAULT_ENDPOINT,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait.")] = 10.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File for f_pi, safetensors; its inputs and scales are in the metadata."),
+    ] = None,
+    certs: options.Certs = None,
+    as_json: options.Json = False,
+    insecure: options.Insecure = False,
+) -> None:
+    """What a running curriculum has, has proposed, and how good its predictions were."""
+    with open_client(options.make_link(connect, certs, insecure), patience=timeout) as session:
+        answer = ask(session, Keys("*").snapshot, Nothing(), Snapshot, timeout, patience=timeout)
+    if out is not None:
+        if not answer.network:
+            raise UsageError(f"{answer.algorithm} has no f_pi that --out could save")
+        options.write_file(out, answer.network)
+    values = answer.model_dump(exclude={"network"})
+    if as_json:
+        options.print_json(values)
+        return
+    table = Table(show_header=False)
+    for name, value in values.items():
+        text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+        table.add_row(name, text)
     Console().print(table)

@@ -1,0 +1,243 @@
+"""The curriculum's database, SQLite: candidate starts, tasks in somebody's hands, outcomes, f_pi over time.
+
+What is committed survives the death of the process; with `sync` that of the host too. One thread at a time.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from common.delivery import DuplicateFilter
+from common.errors import UsageError
+from common.messages import Candidate, Category, Origin, Proposal, Requested, decode, encode
+from curriculum.algorithms.base import Pick, Result
+from curriculum.task_space import Entry
+
+SCHEMA = 1
+TABLES = """
+CREATE TABLE candidates (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, encoder TEXT, entry TEXT, observed BLOB
+);
+CREATE TABLE leases (
+    proposal TEXT PRIMARY KEY, at REAL, until REAL, candidate INTEGER, requested TEXT, category TEXT,
+    entry TEXT, q REAL, f REAL
+);
+CREATE TABLE outcomes (
+    id INTEGER PRIMARY KEY, proposal TEXT UNIQUE, at REAL, actor TEXT, requested TEXT, category TEXT,
+    entry TEXT, q REAL, f REAL, success INTEGER
+);
+CREATE TABLE origins (actor TEXT, boot TEXT, next INTEGER, gaps TEXT, PRIMARY KEY (actor, boot));
+CREATE TABLE states (name TEXT PRIMARY KEY, text TEXT, tensors BLOB);
+CREATE TABLE networks (outcomes INTEGER PRIMARY KEY, text TEXT, tensors BLOB);
+"""
+
+
+class Lease(NamedTuple):
+    """A task in somebody's hands."""
+
+    candidate: int | None
+    requested: Requested
+    category: Category
+    entry: Entry
+    f: float | None
+
+
+class Outcome(NamedTuple):
+    """An outcome on record."""
+
+    id: int
+    at: float
+    result: Result
+
+
+class Database:
+    """`file` None: in memory. Nothing counts before `commit`. UsageError for a file of another kind."""
+
+    def __init__(self, file: Path | None, sync: bool = False) -> None:
+        self.name = str(file or "the database in memory")
+        try:
+            if file is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+            self._sql = sqlite3.connect(file or ":memory:", check_same_thread=False, isolation_level=None)
+            self._sql.execute("BEGIN IMMEDIATE")
+            version = int(self._sql.execute("PRAGMA user_version").fetchone()[0])
+            if version == 0 and not self._sql.execute("SELECT * FROM sqlite_master").fetchone():
+                for statement in TABLES.split(";"):
+                    self._sql.execute(statement)
+                self._sql.execute(f"PRAGMA user_version={SCHEMA}")
+                version = SCHEMA
+            self._sql.execute("COMMIT")
+            if version != SCHEMA:
+                raise UsageError(f"{self.name} is of version {version}; this one reads {SCHEMA}")
+            self._sql.execute("PRAGMA journal_mode=WAL")
+            self._sql.execute(f"PRAGMA synchronous={'FULL' if sync else 'NORMAL'}")
+        except (OSError, sqlite3.DatabaseError) as error:
+            raise UsageError(f"cannot open {self.name}: {error}") from None
+
+    def _do(self, statement: str, values: Iterable[Any] = ()) -> sqlite3.Cursor:
+        try:
+            if not self._sql.in_transaction:
+                self._sql.execute("BEGIN IMMEDIATE")
+            return self._sql.execute(statement, tuple(values))
+        except sqlite3.OperationalError as error:
+            raise OSError(f"{self.name}: {error}") from None
+
+    def commit(self) -> None:
+        """Makes everything since the last commit last.
+
+        Raises OSError when the disk does not take it, as any method that writes may. `roll_back` then, and
+        everything since the last commit is gone.
+        """
+        try:
+            if self._sql.in_transaction:
+                self._sql.execute("COMMIT")
+        except sqlite3.OperationalError as error:
+            raise OSError(f"{self.name}: {error}") from None
+
+    def roll_back(self) -> None:
+        """Forgets everything since the last commit."""
+        if self._sql.in_transaction:
+            self._sql.execute("ROLLBACK")
+
+    def close(self) -> None:
+        """Without a commit."""
+        self._sql.close()
+
+    def add_candidate(self, entry: Entry, encoder: str) -> None:
+        """Takes a candidate in, and tells it its row."""
+        assert entry.observed is not None
+        found = self._do(
+            "INSERT INTO candidates (encoder, entry, observed) VALUES (?, ?, ?)",
+            (encoder, json.dumps(entry.dump()), encode(entry.observed)),
+        )
+        entry.row = found.lastrowid
+
+    def drop_candidate(self, row: int) -> None:
+        """Takes one out."""
+        self._do("DELETE FROM candidates WHERE id = ?", (row,))
+
+    def candidates(self, encoder: str) -> Iterator[Entry]:
+        """Those of one encoder, oldest first."""
+        query = "SELECT id, entry, observed FROM candidates WHERE encoder = ? ORDER BY id"
+        for row, dumped, observed in self._sql.execute(query, (encoder,)):
+            entry = Entry.load(json.loads(dumped))
+            entry.row, entry.observed = row, decode(Candidate, observed)
+            yield entry
+
+    def lease(self, proposal: Proposal, pick: Pick, seconds: float) -> None:
+        """Notes that a task was handed out."""
+        entry, now = pick.entry, time.time()
+        entry.lease = now + seconds
+        self._do(
+            "INSERT INTO leases VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                proposal.id,
+                now,
+                entry.lease,
+                entry.row,
+                pick.requested,
+                pick.category,
+                json.dumps(entry.dump()),
+                entry.q,
+                pick.f,
+            ),
+        )
+
+    def leases(self) -> dict[int, float]:
+        """Until when candidates are handed out, by row."""
+        query = "SELECT candidate, max(until) FROM leases WHERE candidate NOTNULL GROUP BY candidate"
+        return dict(self._sql.execute(query).fetchall())
+
+    def drop_candidates_but(self, encoder: str) -> None:
+        """Drops those of other encoders."""
+        self._do("DELETE FROM candidates WHERE encoder != ?", (encoder,))
+
+    def drop_leases(self, before: float) -> None:
+        """Drops those that ran out before then, seconds since 1970."""
+        self._do("DELETE FROM leases WHERE until < ?", (before,))
+
+    def count_leases(self) -> int:
+        """Tasks in somebody's hands."""
+        query = "SELECT count(*) FROM leases WHERE until >= ?"
+        return int(self._sql.execute(query, (time.time(),)).fetchone()[0])
+
+    def end_lease(self, proposal: str) -> Lease | None:
+        """What was handed out under this name, from now on no longer."""
+        found = self._do("DELETE FROM leases WHERE proposal = ? RETURNING *", (proposal,)).fetchone()
+        if found is None:
+            return None
+        _, _, _, candidate, requested, category, dumped, q, f = found
+        entry = Entry.load(json.loads(dumped))
+        entry.q = q
+        return Lease(candidate, requested, category, entry, f)
+
+    def add_outcome(
+        self, proposal: str | None, actor: str, result: Result, requested: Requested | None = None
+    ) -> bool:
+        """Keeps an outcome; False when that of this proposal is known."""
+        entry = result.entry
+        found = self._do(
+            "INSERT OR IGNORE INTO outcomes (proposal, at, actor, requested, category, entry, q, f, success) "
+            "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                proposal,
+                time.time(),
+                actor,
+                requested,
+                result.category,
+                json.dumps(entry.dump()),
+                entry.q,
+                result.f,
+                int(result.success),
+            ),
+        )
+        return found.rowcount == 1
+
+    def outcomes(self, after: int = 0) -> Iterator[Outcome]:
+        """Those on record, oldest first."""
+        for number, at, category, dumped, q, f, success in self._sql.execute(
+            "SELECT id, at, category, entry, q, f, success FROM outcomes WHERE id > ? ORDER BY id", (after,)
+        ):
+            entry = Entry.load(json.loads(dumped))
+            entry.q = q
+            yield Outcome(number, at, Result(entry, category, f, bool(success)))
+
+    def last_outcome(self) -> int:
+        """Number of the newest; 0 before the first."""
+        return int(self._sql.execute("SELECT coalesce(max(id), 0) FROM outcomes").fetchone()[0])
+
+    def keep_origin(self, seen: DuplicateFilter, origin: Origin) -> None:
+        """Keeps what a filter will know of the sender of a message."""
+        *key, following, gaps = seen.after(origin)
+        values = (*key, following, json.dumps(gaps))
+        self._do("INSERT OR REPLACE INTO origins VALUES (?, ?, ?, ?)", values)
+
+    def origins(self) -> DuplicateFilter:
+        """A filter that knows what has arrived."""
+        seen = DuplicateFilter()
+        for actor, boot, following, gaps in self._sql.execute("SELECT * FROM origins"):
+            seen.restore([[actor, boot, following, json.loads(gaps)]])
+        return seen
+
+    def save_state(self, name: str, values: Any, tensors: bytes) -> None:
+        """Keeps a state, in place of the last one of that name."""
+        self._do("INSERT OR REPLACE INTO states VALUES (?, ?, ?)", (name, json.dumps(values), tensors))
+
+    def load_state(self, name: str) -> tuple[Any, bytes] | None:
+        """The state of that name."""
+        found = self._sql.execute("SELECT text, tensors FROM states WHERE name = ?", (name,)).fetchone()
+        return found and (json.loads(found[0]), found[1])
+
+    def save_network(self, outcomes: int, values: Any, tensors: bytes) -> None:
+        """Keeps what an algorithm had learned after so many outcomes."""
+        self._do("INSERT OR REPLACE INTO networks VALUES (?, ?, ?)", (outcomes, json.dumps(values), tensors))
+
+    def networks(self) -> list[tuple[int, Any, bytes]]:
+        """The history of f_pi: outcomes, values, tensors."""
+        rows = self._sql.execute("SELECT outcomes, text, tensors FROM networks ORDER BY outcomes").fetchall()
+        return [(number, json.loads(text), tensors) for number, text, tensors in rows]
