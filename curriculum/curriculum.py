@@ -32,7 +32,7 @@ from curriculum.algorithms.base import Pick, Result, State
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.calibration import brier_score, reliability
 from curriculum.critic import CriticView
-from curriculum.database import Database
+from curriculum.database import Database, Lease
 from curriculum.task_space import Entry, make_space
 
 log = logging.getLogger(__name__)
@@ -69,11 +69,16 @@ class _Cell:
 
     def draw(self, count: int) -> list[Entry]:
         owner, now = self._owner, time.time()
-        free = [entry for entry in self.entries.values() if entry.lease <= now]
-        valued = [entry for entry in free if entry.q is not None]
-        free = valued or free  # f_pi does not compare with Q and without
-        if free:
-            return [free[int(i)] for i in owner.rng.permutation(len(free))[:count]]
+        entries, valued, others = list(self.entries.values()), list[Entry](), list[Entry]()
+        for i in owner.rng.permutation(len(entries)).tolist():
+            entry = entries[i]
+            if entry.lease <= now:
+                (others if entry.q is None else valued).append(entry)
+            if len(valued) == count or (owner.critic.version is None and len(others) == count):
+                break
+        found = valued or others[:count]  # f_pi does not compare with Q and without
+        if found:
+            return found
         share = owner.config.curriculum.narrowed_candidates
         return [owner.space.candidate(self.cell, share, owner.rng) for _ in range(count)]
 
@@ -173,11 +178,11 @@ class Curriculum:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """All of it lasts afterwards, or after an OSError nothing."""
+        """All of it lasts afterwards, or after an error nothing."""
         try:
             yield
             self.database.commit()
-        except OSError:
+        except BaseException:
             self.database.roll_back()
             raise
 
@@ -233,19 +238,17 @@ class Curriculum:
 
     def report(self, outcome: Outcome, origin: Origin) -> None:
         """Takes how a task ended, once for each proposal; MessageError for an impossible task."""
-        by_itself, row = self._entry(outcome.task), None
         with self._writing():
             lease = self.database.end_lease(outcome.proposal) if outcome.proposal else None
-            result = Result(by_itself, "unserved", None, outcome.success)
-            if lease is not None:
-                result, row = Result(lease.entry, lease.category, lease.f, outcome.success), lease.candidate
-            if row is not None:
-                self.database.drop_candidate(row)
-            requested = lease.requested if lease else None
-            is_new = self.database.add_outcome(outcome.proposal, origin.actor, result, requested)
+            if lease is None:
+                lease = Lease(None, None, "unserved", self._entry(outcome.task), None)
+            result = Result(lease.entry, lease.category, lease.f, outcome.success)
+            if lease.candidate is not None:
+                self.database.drop_candidate(lease.candidate)
+            is_new = self.database.add_outcome(outcome.proposal, origin.actor, result, lease.requested)
             self.database.keep_origin(self.seen, origin)
         self.seen.add(origin)
-        self.cells[result.entry.cell].entries.pop(row or 0, None)
+        self.cells[lease.entry.cell].entries.pop(lease.candidate or 0, None)
         if is_new:
             self._learn(result)
 

@@ -9,6 +9,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ class Lease(NamedTuple):
     """A task in somebody's hands."""
 
     candidate: int | None
-    requested: Requested
+    requested: Requested | None
     category: Category
     entry: Entry
     f: float | None
@@ -59,7 +60,7 @@ class Database:
     """`file` None: in memory. Nothing counts before `commit`. UsageError for a file of another kind."""
 
     def __init__(self, file: Path | None, sync: bool = False) -> None:
-        self.name = str(file or "the database in memory")
+        self.name, self._file = str(file or "the database in memory"), file
         try:
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -75,6 +76,7 @@ class Database:
             if version != SCHEMA:
                 raise UsageError(f"{self.name} is of version {version}; this one reads {SCHEMA}")
             self._sql.execute("PRAGMA journal_mode=WAL")
+            self._sql.execute("PRAGMA wal_autocheckpoint=0")  # a query would wait; see checkpoint
             self._sql.execute(f"PRAGMA synchronous={'FULL' if sync else 'NORMAL'}")
         except (OSError, sqlite3.DatabaseError) as error:
             raise UsageError(f"cannot open {self.name}: {error}") from None
@@ -98,6 +100,12 @@ class Database:
                 self._sql.execute("COMMIT")
         except sqlite3.OperationalError as error:
             raise OSError(f"{self.name}: {error}") from None
+
+    def checkpoint(self) -> None:
+        """Moves what was committed from the write-ahead log to its place; may run beside other threads."""
+        if self._file is not None:
+            with suppress(sqlite3.OperationalError), closing(sqlite3.connect(self._file)) as own:
+                own.execute("PRAGMA wal_checkpoint(PASSIVE)")
 
     def roll_back(self) -> None:
         """Forgets everything since the last commit."""

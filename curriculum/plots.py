@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from common.config import Config, CurriculumConfig, parse
 from common.errors import UsageError
+from common.messages import Category
 from curriculum.algorithms.base import State
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.calibration import brier_score, reliability
@@ -68,6 +69,11 @@ STYLES: dict[str, tuple[str, Any]] = {
 """Colours that the colour-blind can tell apart (Okabe and Ito 2008) and lines; in the order of the stack."""
 
 
+QUERY = "SELECT coalesce(requested, ''), category, entry, f, success FROM outcomes ORDER BY id"
+FILTERED: tuple[Category, ...] = ("easy", "frontier")
+"""Requests that adaptive filtering may fail to meet."""
+
+
 class LeftOutError(Exception):
     """A picture that this run does not have; the text is the reason."""
 
@@ -87,7 +93,10 @@ class History(NamedTuple):
     config: Config
     properties: dict[str, Floats]
     """By name, (N,), the axes of the pictures first; m and rad in the docking world."""
+    requested: NDArray[np.str_]
+    """What the task was to be, (N,); empty where nobody asked for anything."""
     category: NDArray[np.str_]
+    """What it is."""
     f: Floats
     """Predicted before the outcome, (N,); NaN where nothing was."""
     success: Flags
@@ -120,13 +129,13 @@ def read(run: Path) -> History:
             version = sql.execute("PRAGMA user_version").fetchone()[0]
             if version != SCHEMA:
                 raise UsageError(f"{file} is of version {version}; this one reads {SCHEMA}")
-            rows = sql.execute("SELECT category, entry, f, success FROM outcomes ORDER BY id").fetchall()
+            rows = sql.execute(QUERY).fetchall()
             networks = _read_networks(sql, len(rows))
         finally:
             sql.close()
     except sqlite3.DatabaseError as error:
         raise UsageError(f"cannot read {file}: {error}") from None
-    tasks = [json.loads(entry)[2] for _, entry, _, _ in rows]
+    tasks = [json.loads(entry)[2] for _, _, entry, _, _ in rows]
     names = _ordered(config.curriculum, tasks[-1] if tasks else {})
     try:
         properties = {name: np.array([task[name] for task in tasks], float) for name in names}
@@ -137,8 +146,9 @@ def read(run: Path) -> History:
         config,
         properties,
         np.array([row[0] for row in rows], str),
-        np.array([row[2] for row in rows], float),
-        np.array([row[3] for row in rows], bool),
+        np.array([row[1] for row in rows], str),
+        np.array([row[3] for row in rows], float),
+        np.array([row[4] for row in rows], bool),
         networks,
     )
 
@@ -218,6 +228,14 @@ def task_mix(history: History) -> dict[str, Floats]:
     of = moving_sum(np.ones(len(history), bool), size)
     present = [name for name in STYLES if (history.category == name).any()]
     return {name: moving_sum(history.category == name, size) / of for name in present}
+
+
+def met(history: History, name: str) -> Floats:
+    """Share of the last requests for a type that were met, (N,); NaN where there are hardly any."""
+    asked, size = history.requested == name, window(len(history))
+    of = moving_sum(asked, size)
+    share = moving_sum(asked & (history.category == name), size) / np.maximum(of, 1)
+    return np.asarray(np.where(of >= FEW, share, np.nan))
 
 
 def success_of(history: History, category: str | None = None) -> Floats:
@@ -456,16 +474,19 @@ def draw_mix(history: History) -> Figure:
     size, mix = window(len(history)), task_mix(history)
     at = np.unique(np.linspace(size // 2, len(history) - 1, POINTS).astype(int))
     title = f"{history.name}: the last {size:,} outcomes, by category of the task"
-    rows = min(len(mix), 2)  # a single category has all the share
-    figure = _figure(title, 4.0 * rows)
+    filtered = bool(np.isin(history.requested, FILTERED).any())
+    rows = 2 + filtered if len(mix) > 1 else 1  # a single category has all the share
+    figure = _figure(title, 4.0 * min(rows, 2) + 2.0 * (rows > 2))
     panels = list(figure.subplots(rows, 1, sharex=True, squeeze=False).flat)
     if rows > 1:
         _draw_shares(panels[0], history, mix, at)
     _draw_success(panels[-1], history, mix, at)
+    if rows > 2:
+        _draw_met(panels[1], history, at)
     for axes in panels:
         axes.margins(x=0)
         axes.grid(alpha=0.3)
-        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, reverse=axes is not panels[-1])
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, reverse=axes is panels[0])
     return figure
 
 
@@ -473,10 +494,14 @@ def _draw_shares(axes: Axes, history: History, mix: dict[str, Floats], at: NDArr
     shown = [100 * values[at] for values in mix.values()]
     colours = [STYLES[name][0] for name in mix]
     axes.stackplot(at + 1, shown, labels=list(mix), colors=colours, edgecolor="white")
-    if "random" in mix and not {"easy", "frontier"}.isdisjoint(mix):
-        limit = 100 * history.config.curriculum.random_limit
-        axes.axhline(limit, color="black", linestyle="--", label="requests for\nrandom, at most")
     axes.set(ylabel="share of tasks, %", ylim=(0, 100))
+
+
+def _draw_met(axes: Axes, history: History, at: NDArray[np.int64]) -> None:
+    for name in FILTERED:
+        colour, line = STYLES[name]
+        axes.plot(at + 1, 100 * met(history, name)[at], color=colour, linestyle=line, linewidth=2, label=name)
+    axes.set(ylabel="requests met, %", ylim=(-2, 102))
 
 
 def _draw_success(axes: Axes, history: History, mix: dict[str, Floats], at: NDArray[np.int64]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -44,8 +45,10 @@ CRITIC_REST_SECONDS = 6.0
 """Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
 TICK = 0.2
 """Seconds between two looks around."""
-Q_SECONDS, Q_BATCH = 0.05, 64
-"""Of a tick at most for Q of candidates, so many at a time."""
+Q_SECONDS, Q_BATCH = 0.03, 16
+"""Of a tick at most for Q of candidates, so few at a time that a question hardly waits for them."""
+SWITCH_SECONDS = 0.0005
+"""After which Python lets another thread in: its own 5 ms are a task's whole time."""
 
 
 class CurriculumService:
@@ -64,6 +67,7 @@ class CurriculumService:
         group: str = LOCAL,
     ) -> None:
         torch.set_num_threads(1)
+        sys.setswitchinterval(SWITCH_SECONDS)
         sync = config.learner.durability == "host"
         database = Database(folder / DATABASE if folder else None, sync)
         self.curriculum = Curriculum(config, database, (digest or {}).get("encoder", ""))
@@ -95,6 +99,7 @@ class CurriculumService:
             if time.monotonic() - saved >= SAVE_SECONDS:
                 saved = time.monotonic()
                 self.save()
+                self.curriculum.database.checkpoint()
 
     def _refresh_q(self) -> None:
         """Takes newer weights, and values candidates by them, a while at a time."""

@@ -44,7 +44,7 @@ class SuccessNetwork:
             for a, b in pairwise(sizes):
                 layers += [nn.Linear(a, b), nn.ReLU()]
             self.net = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
-        self._optimizer = torch.optim.Adam(self.net.parameters(), config.learning_rate)
+        self._optimizer = torch.optim.Adam(self.net.parameters(), config.learning_rate, fused=True)
         self._rng = np.random.default_rng([seed, 2])
         self._fresh: list[NDArray[np.float64]] = []
         self._reservoir: deque[NDArray[np.float64]] = deque(maxlen=config.reservoir)
@@ -75,17 +75,17 @@ class SuccessNetwork:
 
     def _fit(self) -> None:
         """`navacl-q`: one step on the m fresh outcomes. `navacl-q+`: several, on draws from the reservoir."""
+        rows = np.array(self._reservoir if self._reservoir_fits else self._fresh)
+        if "q" in self.inputs:
+            real = ~np.isnan(rows[:, -2])
+            enough = real.sum() >= (self.config.batch_size if self._reservoir_fits else 1)
+            rows = rows[real] if enough or real.all() else rows[~real]
+        inputs, labels = self._scale(rows[:, :-1]), torch.from_numpy(rows[:, -1]).float()
         for _ in range(self.config.fit_steps):
-            rows = np.array(self._reservoir if self._reservoir_fits else self._fresh)
-            if "q" in self.inputs:
-                real = ~np.isnan(rows[:, -2])
-                enough = real.sum() >= (self.config.batch_size if self._reservoir_fits else 1)
-                rows = rows[real] if enough or real.all() else rows[~real]
-            if self._reservoir_fits:
-                rows = rows[self._draw(rows[:, -1] > 0)]
-            logits = self.net(self._scale(rows[:, :-1])).squeeze(-1)
-            labels = torch.from_numpy(rows[:, -1]).float()
-            loss = F.binary_cross_entropy_with_logits(logits, labels)
+            draw = self._draw(rows[:, -1] > 0) if self._reservoir_fits else np.arange(len(rows))
+            chosen = torch.from_numpy(draw)
+            logits = self.net(inputs[chosen]).squeeze(-1)
+            loss = F.binary_cross_entropy_with_logits(logits, labels[chosen])
             self._optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self._optimizer.step()

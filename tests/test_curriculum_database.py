@@ -180,6 +180,21 @@ def test_candidates_of_another_encoder_are_dropped():
     assert list(database.candidates("theirs")) == []
 
 
+def test_write_ahead_log_begins_again_after_a_checkpoint(file):
+    database, wal = Database(file), file.with_name(f"{file.name}-wal")
+    sizes = []
+    for _ in range(3):
+        for _ in range(20):
+            database.add_outcome(None, "local/a1", result(observed()))
+            database.commit()
+        sizes.append(wal.stat().st_size)
+        database.checkpoint()
+    assert sizes[0] > 0
+    assert sizes[2] <= sizes[0] + 4 * 4096, "it is written over, not on"
+    assert file.stat().st_size > 4 * 4096
+    assert Database(file).last_outcome() == 60
+
+
 def test_number_of_a_candidate_is_never_used_again():
     database = Database(None)
     first, second = observed(1), observed(2)

@@ -31,6 +31,7 @@ from curriculum.plots import (
     f_pi_axes,
     interval,
     judged,
+    met,
     moving_sum,
     nearby,
     proposed,
@@ -113,12 +114,13 @@ def plot(monkeypatch, capsys, *arguments):
     return call(monkeypatch, capsys, "curriculum", "plot", *arguments)
 
 
-def made_up(category: list[str], success: list[bool]) -> History:
+def made_up(category: list[str], success: list[bool], requested: list[str] | None = None) -> History:
     n = len(success)
     return History(
         "made-up",
         Config(),
         {"distance": np.arange(n, dtype=float)},
+        np.array(requested or [""] * n),
         np.array(category),
         np.full(n, np.nan),
         np.array(success),
@@ -182,6 +184,16 @@ def test_mix_and_success_are_those_of_the_last_outcomes(box):
         assert math.isnan(found) if len(of) < 10 else found == pytest.approx(np.mean(of))
     assert success_of(history)[at] == pytest.approx(np.mean([success for *_, success in last]))
     np.testing.assert_allclose(sum(mix.values()), 1.0)
+
+
+def test_requests_met_are_those_that_got_what_was_asked_for():
+    requested = ["easy", "frontier", "random", "frontier"] * 200
+    category = ["random", "frontier", "random", "random"] * 200
+    history = made_up(category, [True] * 800, requested)
+    assert met(history, "easy")[-1] == 0
+    assert met(history, "frontier")[-1] == pytest.approx(0.5, abs=0.1)
+    assert np.isnan(met(history, "gate")).all()
+    assert len(draw_mix(history).axes) == 3
 
 
 def test_success_of_a_category_that_hardly_occurs_is_not_drawn():

@@ -44,6 +44,8 @@ from tests.helpers import small_config, tiny_episode, wait_until
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ADDRESS = "local/fuzz"
+TIMEOUT = 10.0
+"""Seconds; so long Zenoh keeps some 0.8 KB of a query, answered or not."""
 IN_FLIGHT = 64
 JUNK: tuple[Any, ...] = (
     *(None, True, -1, 2**31, 2**63, -(2**63), 1.5, float("nan"), float("inf")),
@@ -250,7 +252,7 @@ def send_wrong(client: zenoh.Session, channel: Channel, count: int, seed: int) -
             client.put(channel.key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
             continue
         header = header_of(payload, i, dice)[0] if channel.delivered else b""
-        ask_later(client, channel.key, payload, answers.put, 60.0, header)
+        ask_later(client, channel.key, payload, answers.put, TIMEOUT, header)
         if i >= IN_FLIGHT:
             settle()
     if not channel.told:
