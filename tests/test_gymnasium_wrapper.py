@@ -312,6 +312,7 @@ def test_wrong_endpoint_and_name_are_said_at_once(endpoint, tmp_path):
         CurriculumWrapper(Walk(), make_link(endpoint), tmp_path, "env", patience=0.0)
 
 
+@pytest.mark.slow
 def test_example_learns_faster_with_the_curriculum_than_from_uniform_tasks():
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / "gymnasium_curriculum.py"), "--seed", "1"],

@@ -1,13 +1,14 @@
 """The command `navaclq`, also as `python -m deploy.cli`."""
 
 import signal
-import traceback
-from typing import NoReturn
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # until a command handles it, Ctrl-C ends all without a word
 
 
-def run() -> NoReturn:
-    """Loads the commands, during which Ctrl-C ends the process without a word, and runs one."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def run() -> None:
+    """Loads the commands and runs one; does not return."""
+    import traceback
+
     from common.link import end_process
     from deploy.cli.main import run as run_command
 
