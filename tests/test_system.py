@@ -127,7 +127,7 @@ def test_train_sums_up_as_json_resumes_and_restarts_what_dies(tmp_path):
         "updates",
         "load_average",
     } <= set(result)
-    assert (result["seed"], result["preset"], result["minutes"]) == (3, "smoke", 0.2)
+    assert (result["seed"], result["preset"], result["minutes"]) == (3, "smoke", pytest.approx(0.2, abs=0.05))
     assert result["updates"] > 0
 
     again = subprocess.Popen(
