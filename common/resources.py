@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,24 @@ from common.errors import UsageError
 def learner_threads(wanted: int | str, cores: int) -> int:
     """Threads of torch for a learner that shares its cores with actors."""
     return wanted if isinstance(wanted, int) else max(1, min(4, cores // 2))
+
+
+def one_torch_thread() -> None:
+    """Before torch is loaded: its operations use one thread each, whichever thread of ours calls them.
+
+    More of them wait for each other by spinning: on two cores actors so made a sixth fewer steps, and a task
+    of the curriculum took four times as long. Whoever set OMP_NUM_THREADS is obeyed.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def give_way() -> None:
+    """The calling thread, and what it starts from now on, lets others go first.
+
+    What computes for hours must not hold up what answers within milliseconds: the session's threads, which
+    are there already, and the curriculum.
+    """
+    os.nice(10)
 
 
 def check_memory(what: str, need: float, cure: str) -> None:

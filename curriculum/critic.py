@@ -29,13 +29,14 @@ class CriticView:
     def load(self, version: Version, tensors: dict[str, Tensor]) -> None:
         """Takes newer weights; ValueError when they do not fit."""
         load_state(tensors, perception=self._perception, policy=self._policy, critic=self._critic)
-        self.version = version
+        if version != self.version:  # what is known under a version is recognised by the object
+            self.version = version
 
     def stale(self, entries: Iterable[Entry]) -> list[Entry]:
         """Those whose Q could be newer."""
         if self.version is None:
             return []
-        return [e for e in entries if e.observed is not None and e.q_version != self.version]
+        return [e for e in entries if e.q_version is not self.version and e.observed is not None]
 
     def refresh(self, entries: Iterable[Entry]) -> list[Entry]:
         """Renews Q of those that were valued under other weights, in one batch; returns them."""

@@ -9,7 +9,7 @@ import uuid
 from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 import safetensors.torch
@@ -68,19 +68,21 @@ class _Cell:
         self.entries: OrderedDict[int, Entry] = OrderedDict()
 
     def draw(self, count: int) -> list[Entry]:
-        owner, now = self._owner, time.time()
-        entries, valued, others = list(self.entries.values()), list[Entry](), list[Entry]()
-        for i in owner.rng.permutation(len(entries)).tolist():
-            entry = entries[i]
-            if entry.lease <= now:
-                (others if entry.q is None else valued).append(entry)
-            if len(valued) == count or (owner.critic.version is None and len(others) == count):
-                break
-        found = valued or others[:count]  # f_pi does not compare with Q and without
+        owner, now, entries = self._owner, time.time(), list(self.entries.values())
+        order = owner.rng.permutation(len(entries)).tolist()
+
+        def free(valued: bool) -> list[Entry]:
+            """As many as are asked for; f_pi does not compare those with Q and without."""
+            fit = (e for i in order if (e := entries[i]).lease <= now and (e.q is not None) == valued)
+            return list(islice(fit, count))
+
+        found = free(valued=True) or free(valued=False)
         if found:
             return found
         share = owner.config.curriculum.narrowed_candidates
-        return [owner.space.candidate(self.cell, share, owner.rng) for _ in range(count)]
+        return [
+            owner.space.candidate(self.cell, share, owner.rng) for _ in range(min(count, owner.space.at_once))
+        ]
 
     def new(self, level: float = 1.0) -> Entry:
         return self._owner.space.draw(self.cell, level, self._owner.rng)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import torch
 import zenoh
 
 from common.access import LOCAL
@@ -45,7 +44,7 @@ CRITIC_REST_SECONDS = 6.0
 """Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
 TICK = 0.2
 """Seconds between two looks around."""
-Q_SECONDS, Q_BATCH = 0.03, 16
+Q_SECONDS, Q_BATCH, Q_REST = 0.03, 16, 0.0005
 """Of a tick at most for Q of candidates, so few at a time that a question hardly waits for them."""
 SWITCH_SECONDS = 0.0005
 """After which Python lets another thread in: its own 5 ms are a task's whole time."""
@@ -66,7 +65,6 @@ class CurriculumService:
         folder: Path | None,
         group: str = LOCAL,
     ) -> None:
-        torch.set_num_threads(1)
         sys.setswitchinterval(SWITCH_SECONDS)
         sync = config.learner.durability == "host"
         database = Database(folder / DATABASE if folder else None, sync)
@@ -115,8 +113,10 @@ class CurriculumService:
         with self._lock:
             stale = self.curriculum.stale()
         while stale and time.monotonic() < until:
-            critic.refresh(stale[:Q_BATCH])
+            with self._lock:  # beside a question's many small operations it would cost more than before it
+                critic.refresh(stale[:Q_BATCH])
             del stale[:Q_BATCH]
+            time.sleep(Q_REST)  # for whoever waits for the lock
 
     def save(self) -> None:
         """Keeps the state; a full disk must not end the service."""

@@ -102,7 +102,7 @@ class SuccessNetwork:
 
     def _rows(self, properties: Sequence[Properties], q: Sequence[float | None]) -> NDArray[np.float64]:
         """The inputs of N tasks, properties scaled, Q last as it is."""
-        values = np.array([[p[name] for name in self._names] for p in properties], float)
+        values = np.array([p[name] for p in properties for name in self._names], float)
         values = np.clip(values, -HUGE, HUGE).reshape(len(properties), len(self._names))
         rows = (values - self._centres) / self._halves
         if "q" in self.inputs:

@@ -71,6 +71,8 @@ class TaskSpace(ABC):
     inputs: tuple[str, ...]
     """What f_pi sees of a task, Q included."""
     scales: Scales
+    at_once = 200
+    """Tasks drawn for a request, at most, while there are no candidates."""
 
     @abstractmethod
     def draw(self, cell: int, level: float, rng: np.random.Generator) -> Entry:
@@ -87,6 +89,8 @@ class TaskSpace(ABC):
 
 class DockingSpace(TaskSpace):
     """The docking world's tasks, cell by cell."""
+
+    at_once = 25  # a millisecond for each
 
     def __init__(self, config: Config) -> None:
         self._config = config

@@ -54,7 +54,7 @@ class Child:
         return self.process is not None and self.process.poll() is None
 
     def start(self) -> None:
-        """Starts the process in a session of its own, its output appended to the log file."""
+        """Starts the process in a group of its own, its output appended to the log file."""
         self.log_file.parent.mkdir(parents=True, exist_ok=True)
         with self.log_file.open("ab") as output:
             self.process = subprocess.Popen(
@@ -62,7 +62,7 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                start_new_session=True,  # Ctrl-C reaches the launcher, which stops its children in order
+                process_group=0,  # Ctrl-C reaches the launcher, which stops its children in order
             )
         self.started = time.monotonic()
 

@@ -52,7 +52,7 @@ class Pool:
         self.cell, self._space, self.rng = cell, space, np.random.default_rng(seed)
 
     def draw(self, count: int) -> list[Entry]:
-        return [self.new() for _ in range(count)]
+        return [self.new() for _ in range(min(count, 100))]
 
     def new(self, level: float = 1.0) -> Entry:
         return self._space.draw(self.cell, level, self.rng)

@@ -122,6 +122,7 @@ def test_the_onnx_file_gives_the_codes_of_the_weights(trained):
     assert codes.std() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_an_encoder_is_examined_to_the_same_figures_again(trained):
     run, result = trained

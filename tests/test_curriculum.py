@@ -29,7 +29,9 @@ PLUS = small_config(OPEN)
 LETTER = small_config(OPEN, "curriculum.algorithm='navacl-q'", f"curriculum.inputs={[*GEOMETRIC[:4], 'q']}")
 RND = small_config(OPEN, "curriculum.algorithm='rnd'")
 FEW, FEW_LETTER = (
-    config.model_copy(update={"curriculum": config.curriculum.model_copy(update={"filter_samples": 8})})
+    config.model_copy(
+        update={"curriculum": config.curriculum.model_copy(update={"filter_samples": 8, "max_draws": 8})}
+    )
     for config in (PLUS, LETTER)
 )
 """An empty database is soon made up for."""

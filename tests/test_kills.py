@@ -3,13 +3,19 @@
 import json
 import random
 import time
+from collections.abc import Callable
+from typing import get_args
 
 import pytest
 
 from common.access import LOCAL
-from common.bus import Member
+from common.bus import Keys, Member, ask
+from common.config import parse
 from common.delivery import Sender, Spool
-from common.messages import Episode, decode
+from common.messages import Category, Episode, Nothing, Snapshot, decode
+from curriculum.curriculum import Curriculum
+from curriculum.database import Database
+from curriculum.service import DATABASE
 from tests.crew import RESUMED, Crew, assert_nothing_is_lost_and_nothing_there_twice, ids, losses_of
 from tests.helpers import wait_until
 
@@ -95,6 +101,49 @@ def test_learner_that_is_killed_three_times_loses_nothing_and_learns_on(crew):
 @pytest.mark.timeout(1800)
 def test_learner_that_is_killed_twenty_times_loses_nothing_and_learns_on(crew):
     learner_is_killed(crew, 20, seed=2)
+
+
+@pytest.mark.slow
+def test_curriculum_that_is_killed_knows_what_it_knew_and_no_actor_stops(crew):
+    keys = Keys("run")
+    crew.settings = ("--set", "curriculum.gate.enabled=false")
+    crew.start_learner()
+    for name in ("curriculum", "a", "b"):
+        crew.start_other(name)
+
+    def grown(figure: Callable[[dict], int], least: int, what: str) -> None:
+        """Waits until each actor's figure is larger by so much."""
+        for name, values in crew.monitor.of("actor").items():
+            enough = figure(values) + least
+
+            def reached(name: str = name, enough: int = enough) -> bool:
+                return figure(crew.monitor.of("actor").get(name, {})) >= enough
+
+            wait_until(reached, 60, f"{what} of {name}")
+
+    def served(values: dict) -> int:
+        return sum(values.get(f"task_{name}", 0) for name in get_args(Category) if name != "unserved")
+
+    with crew.listening() as session:
+        wait_until(lambda: crew.monitor.curriculum.get("fits", 0) >= 4, 90, "an f_pi that has learned")
+        grown(served, 3, "tasks")
+        before = ask(session, keys.snapshot, Nothing(), Snapshot, timeout=5)
+        crew.kill("curriculum")
+        grown(lambda values: values.get("task_unserved", 0), 3, "tasks of their own")
+        grown(lambda values: values.get("env_steps", 0), 100, "steps without a curriculum")
+        crew.start_other("curriculum")
+        after = ask(session, keys.snapshot, Nothing(), Snapshot, timeout=5, patience=60)
+        assert after.outcomes >= before.outcomes > 0
+        assert all(after.proposed[name] >= count / 2 for name, count in before.proposed.items())
+        grown(served, 3, "tasks after its return")
+        wait_until(lambda: max(crew.of_actors("reports")) <= 2, 30, "delivery of what had waited")
+        assert sum(crew.of_actors("reports_refused")) == 0
+        for name in ("a", "b", "curriculum", "learner"):
+            assert crew.stop(name) == 0, crew.words(name)
+    config = parse((crew.run / "config.toml").read_text())
+    left = Curriculum(config, Database(crew.run / DATABASE))
+    assert left.outcomes >= after.outcomes
+    assert left.algorithm.network.fits == left.outcomes // config.curriculum.batch_size, "none forgotten"
 
 
 @pytest.mark.slow

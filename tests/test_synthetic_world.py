@@ -71,27 +71,34 @@ def test_easy_tasks_succeed_more_often_than_frontier_and_those_more_than_uniform
     assert_above(found["frontier"], uniform)
 
 
+@pytest.mark.slow
 def test_frontier_to_the_letter_lies_at_the_mean_and_so_among_hopeless_tasks_when_few_succeed():
     """Why NavACL-Q+ has it at 0.5: where success is rare, most tasks near the mean of f_pi are hopeless."""
     fast = ("curriculum.fit_steps=8", "curriculum.learning_rate=4e-3")
     world = taught(SyntheticWorld(settings("navacl-q-letter", *fast), seed=3, **STILL), 400)
-    found = proposed(world, 250)
+    found = proposed(world, 600)
     uniform = [world.probability(world.new()) for _ in range(1000)]
     assert_above(found["easy"], found["frontier"])
     assert_above(found["easy"], uniform)
     assert_above(uniform, found["frontier"])
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
-def test_brier_score_of_the_predictions_is_within_a_tenth_of_the_best(seed):
+@pytest.mark.parametrize(
+    ("seeds", "tasks", "more"),
+    [((2,), 400, 0.25), pytest.param((1, 2, 3, 4), 1600, 0.1, marks=pytest.mark.slow)],
+    ids=["soon", "in the end"],
+)
+def test_brier_score_of_the_predictions_is_near_the_best(seeds, tasks, more):
     """Of proposed tasks, before their outcomes; p (1 - p) is what nobody can predict away."""
-    world = taught(SyntheticWorld(settings("navacl-q"), seed=seed, **STILL), 800)
-    picks = [world.step() for _ in range(400)]
-    f, p = np.array([pick.f for pick in picks]), np.array([world.probability(x.entry) for x in picks])
+    algorithm = settings("navacl-q", "curriculum.calibrate=true")
+    worlds = [taught(SyntheticWorld(algorithm, seed=seed, **STILL), tasks) for seed in seeds]
+    picks = [(world.step(), world) for world in worlds for _ in range(400)]
+    f, p = np.array([(pick.f, world.probability(pick.entry)) for pick, world in picks]).T
     best = float(np.mean(p * (1 - p)))
-    assert np.mean((f - p) ** 2) + best < 1.1 * best
+    assert np.mean((f - p) ** 2) + best < (1 + more) * best
 
 
+@pytest.mark.slow
 def test_curriculum_teaches_in_a_third_of_the_tasks_that_uniform_ones_take():
     least = 0.9
     ours = SyntheticWorld(settings("navacl-q"), seed=1).tasks_until(least, 3000)

@@ -32,11 +32,10 @@ class NavaclQ(Algorithm):
         """Fits a normal to f_pi over tasks, then draws until one meets the request, at most n_T times."""
         config = self.config
         requested = get_task_type(t, config, rng)
-        sample = pool.draw(config.filter_samples)
-        mu, sigma = fit_normal(self._predict(sample))
-        # an empty database is made up for by geometry, too slow to do twice
-        draws = sample if sample[0].row is None else pool.draw(config.max_draws)
-        f = self._predict(draws)
+        drawn = pool.draw(config.filter_samples + config.max_draws)
+        predicted = self._predict(drawn)
+        mu, sigma = fit_normal(predicted[: config.filter_samples])
+        draws, f = drawn[-config.max_draws :], predicted[-config.max_draws :]  # when few are left, the same
         if config.algorithm == "navacl-q+":
             found = get_anchored_task(requested, f, mu, sigma, config, rng)
         else:

@@ -500,7 +500,7 @@ def _peer(folder: Path, job: str, endpoint: str, *numbers: int) -> Iterator[_Pee
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,
+        process_group=0,
     )
     with process:  # which closes its stdin, and waits
         try:

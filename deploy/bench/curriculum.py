@@ -2,7 +2,8 @@
 
 Real processes: a learner that updates without a pause, a curriculum that joined it and has its critic, a full
 database. One client asks, one question after the other; in turns with it the same client asks a process that
-answers at once, which is the limit. Then many actors ask and report at the rate of a real one each.
+answers at once, which is the limit. Then many actors ask and report at the rate of a real one each. At last
+the curriculum is killed and started again.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -31,9 +32,11 @@ from common.members import Members
 from common.messages import (
     Candidate,
     Candidates,
+    Nothing,
     Outcome,
     Proposal,
     Proposals,
+    Snapshot,
     TaskQuery,
     decode,
     encode,
@@ -43,7 +46,7 @@ from common.tasks import candidate_task
 from deploy.bench.processes import PATIENCE, look_after, running, running_learner
 from deploy.bench.replay import synthetic_episode
 from deploy.bench.report import Report
-from deploy.launcher import free_port
+from deploy.launcher import Child, free_port
 
 RUN = "bench"
 BARE = "bench/bare"
@@ -96,6 +99,7 @@ def bench_curriculum(
             crowd += actors_ask(rng)
             progress(i + 1, "")
         updated = (int(members.learner["updates"]) - updates) / (time.monotonic() - began)
+        away, lost = _kill(child, partial(ask, session, keys.snapshot, Nothing(), Snapshot, 1.0, PATIENCE))
     for label, times in (("query", ours), ("bare_query", limit), (f"actors_{actors}", crowd)):
         for percent, value in zip((50, 99), np.percentile(times, (50, 99)), strict=True):
             report.add(f"{label}_p{percent}_ms", 1000 * float(value), "ms")
@@ -104,6 +108,8 @@ def bench_curriculum(
     report.add(f"actors_{actors}_asked_per_s", len(crowd) / (rounds * WINDOW), "1/s")
     report.add(f"actors_{actors}_unanswered", actors_ask.unanswered, "questions")
     report.add("learner_updates_per_s", updated, "1/s")
+    report.add("restart_after_kill", away, "s")
+    report.add("outcomes_lost_by_kill", lost, "outcomes")
     report.compare("query_over_bare_query", limit_each, ours_each)
     return report
 
@@ -140,12 +146,29 @@ def _fill(
                 for _ in range(BATCH)
             ]
             sender.put(keys.candidates, Candidates(digest=digest, candidates=candidates))
-        deadline = time.monotonic() + PATIENCE
-        while len(sender.spool):
-            if sender.refused or time.monotonic() > deadline:
-                raise RunError(f"the database is not filled: {sender.last_refusal or sender.trouble}")
-            time.sleep(0.01)
+        _drain(sender)
         note(f"database: {done + BATCH} candidates of {config.curriculum.store_per_cell} in each cell")
+
+
+def _drain(sender: Sender) -> None:
+    """Waits until all is delivered."""
+    deadline = time.monotonic() + PATIENCE
+    while len(sender.spool):
+        if sender.refused or time.monotonic() > deadline:
+            raise RunError(f"the curriculum does not take it: {sender.last_refusal or sender.trouble}")
+        time.sleep(0.01)
+
+
+def _kill(child: Child, ask_state: Callable[[], Snapshot]) -> tuple[float, int]:
+    """Seconds from the start of a killed curriculum's successor to its first answer, and what it forgot."""
+    known = ask_state().outcomes
+    assert child.process is not None
+    child.process.kill()
+    child.process.wait()
+    began = time.monotonic()
+    child.start()
+    found = ask_state().outcomes
+    return time.monotonic() - began, known - found
 
 
 def _ask(session: zenoh.Session, keys: Keys, rng: np.random.Generator) -> Proposal:
@@ -177,21 +200,26 @@ class _Crowd:
         """Seconds that each of a window's answers took."""
         answers: queue.SimpleQueue[tuple[float, bytes | Exception]] = queue.SimpleQueue()
         moments = np.sort(rng.uniform(0, WINDOW, rng.poisson(self._rate * WINDOW)))
-        began = time.perf_counter()
+        times, began = list[float](), time.perf_counter()
 
         def hear(asked: float, answer: bytes | Exception) -> None:
             answers.put((time.perf_counter() - asked, answer))
 
+        def take(patience: float) -> None:
+            with suppress(queue.Empty):
+                taken, answer = answers.get(timeout=patience)
+                times.append(taken)
+                self._report(answer, rng)
+
         for moment in moments:
-            time.sleep(max(0.0, began + moment - time.perf_counter()))
+            while (left := began + moment - time.perf_counter()) > 0:
+                take(left)
             question = encode(TaskQuery(cell=int(rng.integers(len(CELLS))), t=100_000))
             asked = partial(hear, time.perf_counter())
             ask_later(self._session, self._keys.task, question, asked, PATIENCE, urgent=True)
-        times = []
-        for _ in moments:
-            taken, answer = answers.get(timeout=2 * PATIENCE)
-            times.append(taken)
-            self._report(answer, rng)
+        while len(times) < len(moments):
+            take(2 * PATIENCE)
+        _drain(self._sender)  # what is measured next must not share the service with reports
         return times
 
     def _report(self, answer: bytes | Exception, rng: np.random.Generator) -> None:

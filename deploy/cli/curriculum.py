@@ -19,6 +19,7 @@ from common.cells import check_cell
 from common.errors import UsageError
 from common.link import Link, open_client, open_hub
 from common.messages import Nothing, Proposals, ScoreQuery, Scores, Snapshot, TaskQuery
+from common.resources import one_torch_thread
 from common.tasks import Task
 from common.telemetry import exit_on_signals, start_logging
 from deploy.cli import options
@@ -52,6 +53,7 @@ def serve_curriculum(
     insecure: options.Insecure = False,
 ) -> None:
     """Answer task queries: beside a learner (--connect), or alone (--listen, the default)."""
+    one_torch_thread()
     from common.contract import accept_contract, fetch_contract
     from curriculum.service import CurriculumService
 

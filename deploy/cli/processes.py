@@ -20,6 +20,7 @@ from common.bus import Member
 from common.errors import UsageError
 from common.files import lock
 from common.link import open_client, open_hub, open_router
+from common.resources import give_way, one_torch_thread
 from common.telemetry import exit_on_signals, start_logging, stop_on_signals
 from deploy.cli import options
 
@@ -51,6 +52,7 @@ def learner(
     start_logging()
     exit_on_signals()
     with open_hub(link) as session:
+        give_way()
         service = LearnerService(session, directory, minutes if minutes is not None else math.inf, link.group)
         log.info("learner of run %r listens on %s", directory.name, link)
         service.run()
@@ -77,6 +79,7 @@ def actor(
     if count > 1:
         _start_many(count, name)
         return
+    one_torch_thread()
     from actor.frames import FrameService
     from actor.service import ActorService
     from common.contract import accept_contract, fetch_contract
@@ -84,6 +87,7 @@ def actor(
     start_logging()
     exit_on_signals()
     with open_client(link, say_waiting(f"the hub at {link}")) as session:
+        give_way()
         leave = f", or to be admitted as {link.group}" if link.credentials else ""
         contract = fetch_contract(session, say_waiting(f"a learner at the hub{leave}"))
         resolved = accept_contract(contract, tuple(settings or ()))
@@ -156,7 +160,7 @@ def _start_many(count: int, base: str | None) -> None:
     try:
         for i in range(count):
             named = ["--name", f"{base}.{i}"] if base else []
-            children.append(subprocess.Popen([*command, *named], start_new_session=True))
+            children.append(subprocess.Popen([*command, *named], process_group=0))
         while any(child.poll() is None for child in children):
             time.sleep(0.2)
     finally:
