@@ -96,12 +96,26 @@ def stop_on_signals() -> threading.Event:
 
 
 def exit_on_signals() -> None:
-    """Turns SIGTERM and SIGINT into SystemExit, so that sessions and files are closed on the way out."""
+    """Turns SIGTERM and SIGINT into SystemExit, once, so that sessions and files are closed on the way out.
+
+    Where Python ignores exceptions, in a callback of an import for example, a signal is given again.
+    """
+    leaving = False
 
     def leave(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        raise SystemExit(0)
+        nonlocal leaving
+        if not leaving:
+            leaving = True
+            raise SystemExit(0)
 
+    def ignored(what: sys.UnraisableHookArgs) -> None:
+        nonlocal leaving
+        if isinstance(what.exc_value, SystemExit):
+            leaving = False
+            threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        else:
+            sys.__unraisablehook__(what)
+
+    sys.unraisablehook = ignored
     signal.signal(signal.SIGTERM, leave)
     signal.signal(signal.SIGINT, leave)

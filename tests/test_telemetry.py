@@ -47,6 +47,31 @@ def test_a_signal_ends_a_process_cleanly_with_its_session_closed(endpoint, numbe
     assert process.returncode == 0
 
 
+IN_A_CALLBACK = """
+import signal, time, weakref
+from common.telemetry import exit_on_signals
+class Gone: pass
+exit_on_signals()
+gone = Gone()
+callback = weakref.ref(gone, lambda _: signal.raise_signal(signal.SIGINT))
+try:
+    del gone
+    print("ignored", flush=True)
+    for _ in range(600):
+        time.sleep(0.05)
+finally:
+    print("closed", flush=True)
+"""
+
+
+def test_a_signal_that_comes_where_python_ignores_exceptions_is_not_lost():
+    """As in an import's callbacks, for the first seconds of every command."""
+    found = subprocess.run(
+        [sys.executable, "-c", IN_A_CALLBACK], capture_output=True, cwd=Path(__file__).parents[1], timeout=25
+    )
+    assert (found.returncode, found.stdout, found.stderr) == (0, b"ignored\nclosed\n", b"")
+
+
 def test_figures_are_due_at_once_and_then_not_again_within_the_second(hub, client):
     got: list[Stat] = []
     keys = Keys("run-1")
