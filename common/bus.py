@@ -228,13 +228,12 @@ def _size(query: zenoh.Query) -> int:
     return sum(len(part) for part in (query.payload, query.attachment) if part is not None)
 
 
-def _read(reply: zenoh.Reply) -> bytes:
+def _read(reply: zenoh.Reply) -> bytes | Exception:
+    """What a reply says. Raised here, an error would keep the reply in its traceback, in a cycle."""
     if reply.ok is not None:
         return reply.ok.payload.to_bytes()
     reason = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else ""
-    if reason == "Timeout":
-        raise NoAnswerError("timeout")
-    raise RefusedError(reason[:400])
+    return NoAnswerError("timeout") if reason == "Timeout" else RefusedError(reason[:400])
 
 
 def ask_bytes(
@@ -291,10 +290,7 @@ def ask_later(
     found: list[bytes | Exception] = []
 
     def collect(reply: zenoh.Reply) -> None:
-        try:
-            found.append(_read(reply))
-        except (NoAnswerError, RefusedError) as error:
-            found.append(error)
+        found.append(_read(reply))
 
     session.get(
         key,

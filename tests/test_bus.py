@@ -1,3 +1,4 @@
+import gc
 import logging
 import subprocess
 import sys
@@ -262,6 +263,28 @@ def test_reason_of_a_refusal_reaches_the_asker(hub, client):
     with pytest.raises(RefusedError, match=r"^contract differs in 'reward'$"):
         ask_bytes(client, KEYS.trajectory, b"'reward'")
     assert server.refused == {"contract differs in 'reward'": 1}
+    server.close()
+
+
+def test_refusals_leave_nothing_behind_for_the_garbage_collector(hub, client):
+    """It would come late: of 100,000 refusals in a large process 80 MB were left."""
+
+    def handler(*_: object) -> bytes:
+        raise MessageError("no")
+
+    server = QueryServer(hub, KEYS.trajectory, handler)
+    heard: list[bytes | Exception] = []
+    gc.collect()
+    gc.disable()
+    try:
+        for i in range(100):
+            ask_later(client, KEYS.trajectory, b"1", heard.append, 10.0)
+            wait_until(lambda i=i: len(heard) == i + 1)
+        assert [str(refusal) for refusal in heard] == ["no"] * 100
+        heard.clear()
+        assert gc.collect() < 100
+    finally:
+        gc.enable()
     server.close()
 
 
