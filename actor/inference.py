@@ -103,3 +103,15 @@ class Eyes:
         count = self._frames_per_code
         stacks = [([frames[0]] * HISTORY + frames)[-count:] for frames in recent]
         return self._encode(np.stack([np.stack(stack) for stack in stacks]))
+
+
+class Blind(Eyes):
+    """For controllers that look at the frames themselves: visual rows of zeros."""
+
+    def __init__(self, config: Config) -> None:
+        layout = ObservationLayout.of(config)
+        self._row = np.zeros(layout.row_shape, layout.row_dtype)
+
+    def see(self, recent: list[list[NDArray[np.uint8]]]) -> NDArray[Any]:
+        """(B, *row_shape) zeros for B worlds."""
+        return np.stack([self._row] * len(recent))

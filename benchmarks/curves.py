@@ -1,6 +1,6 @@
 """Trainings that differ in a few settings: success on suite `train` over environment steps.
 
-    python benchmarks/curves.py --out docs/recipe.png default 1-step:sac.n_step=1 hard:sac.target=hard
+    python benchmarks/curves.py --out docs/recipe.png default 1-step:sac.n_step=1 rnd:variant=rnd
 
 trains one run after another, seed and minutes alike, into runs/curve-NAME-MINUTES-SEED (nothing else should
 run beside), then examines every snapshot. What is there already is not done again. Of a single training it
@@ -18,8 +18,9 @@ from typing import Annotated, Any
 import matplotlib.pyplot as plt
 import typer
 
+from actor.evaluation.figures import COLOURS
+
 SNAPSHOT_STEPS = 15_000
-COLOURS = {"success": "green", "timeout": "gray", "other_contact": "orange", "dolly_contact": "red"}
 Curve = dict[int, dict[str, Any]]
 
 
@@ -31,14 +32,18 @@ def navaclq(*arguments: object) -> dict[str, Any]:
 
 
 def train(variant: str, folder: Path, minutes: float, seed: int) -> tuple[str, Path]:
-    """The name and the run of NAME:section.key=value;..."""
+    """The name and the run of NAME:section.key=value;..., or NAME:variant=VARIANT;..."""
     name, _, settings = variant.partition(":")
     run = folder / f"curve-{name}-{minutes:g}min-seed{seed}"
     if not (run / "result.json").exists():
         if (run / "run.json").exists():
             raise typer.BadParameter(f"{run} was interrupted; remove it, and it is trained anew")
         chosen = [f"learner.snapshot_steps={SNAPSHOT_STEPS}", *filter(None, settings.split(";"))]
-        options = [part for setting in chosen for part in ("--set", setting)]
+        options = [
+            part
+            for setting in chosen
+            for part in (["--variant", setting[8:]] if setting.startswith("variant=") else ["--set", setting])
+        ]
         navaclq("train", "--run", run, "--minutes", minutes, "--seed", seed, *options)
     return name, run
 
@@ -76,7 +81,7 @@ def draw_endings(axes: plt.Axes, curve: Curve) -> None:
 
 def main(
     variants: Annotated[
-        list[str], typer.Argument(help="NAME or NAME:section.key=value[;section.key=value...]")
+        list[str], typer.Argument(help="NAME, or NAME: and section.key=value or variant=VARIANT, split by ;")
     ],
     out: Annotated[Path, typer.Option(help="PNG file to draw.")],
     folder: Annotated[Path, typer.Option(help="Where the runs are kept.")] = Path("runs"),

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from common.cells import CELLS, ROOMS, Box, Cell, Kind, arena_index
+from common.cells import CELLS, ROOMS, Box, Cell, Kind
 from common.config import Config
 from common.errors import UsageError
 from common.geometry import SE2, Rectangle, bearing, distance_to_rectangle, rectangles_overlap, wrap
@@ -30,8 +30,6 @@ CATALOGUE_SIZE = 12
 """Boxes that obstacles are taken from."""
 DRAWS, DISTANCES = 200, 5
 """Draws of a scene for one distance, and distances that are tried: so they stay uniform whatever fits."""
-GRID_HEADINGS = (0, -45, 45, -90, 90, -135, 135, 180)
-"""Degrees (section 4.2)."""
 
 
 class PlacedStart(Section):
@@ -296,38 +294,3 @@ def narrowed_task(cell: int, config: Config, rng: np.random.Generator, share: fl
 def candidate_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
     """A task for the curriculum's database."""
     return narrowed_task(cell, config, rng, config.curriculum.narrowed_candidates)
-
-
-SUITES = ("short", "train")
-"""Fixed lists of evaluation tasks in the training cells; training never draws their seeds."""
-
-
-def suite(name: str, config: Config) -> list[Task]:
-    """The tasks of a suite: `short`, 100 near and straight ones; `train`, 400 of the full distribution."""
-    if name == "short":
-        start = StartRanges(distance_max=2.0, yaw=20.0, bearing=4.0, dolly_yaw=4.0)
-        return [Task(cell=i % len(CELLS), seed=FIRST_SUITE_SEED + i, start=start) for i in range(100)]
-    if name == "train":
-        return [
-            Task(cell=i % len(CELLS), seed=2 * FIRST_SUITE_SEED + i, start=config.world.start)
-            for i in range(400)
-        ]
-    raise UsageError(f"suite {name!r} does not exist; choose one of {', '.join(SUITES)}")
-
-
-def grid(arena: str, repeats: int, seed: int = 0) -> list[Task]:
-    """The grid test (section 4.2): 11 x 11 starts, 8 headings, `repeats` that differ in all but the start.
-
-    968 tasks for each repeat. Raises UsageError for an unknown arena.
-    """
-    starts = [
-        PlacedStart(x=-2.5 + 0.5 * column, y=-1.5 - 0.5 * row, yaw=heading)
-        for heading in GRID_HEADINGS
-        for row in range(11)
-        for column in range(11)
-    ]
-    first = 4 * FIRST_SUITE_SEED + seed * 2**20
-    return [
-        Task(cell=arena_index(arena), seed=first + index, start=start)
-        for index, start in enumerate(starts * repeats)
-    ]

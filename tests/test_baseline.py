@@ -9,12 +9,13 @@ import pytest
 
 from actor.baseline.docking import ScriptedController, approach
 from actor.baseline.planning import plan
-from actor.evaluation import Scripted, evaluate
+from actor.evaluation.examiner import Baseline, Terms, examine
+from actor.evaluation.suites import grid
 from actor.world.world import DockingWorld
 from common.cells import Box
 from common.config import Config
 from common.geometry import SE2, Rectangle, as_rows, separations, wrap
-from common.tasks import Obstacle, Scene, build_scene, dolly_sides, grid, random_task, surfaces
+from common.tasks import Obstacle, Scene, build_scene, dolly_sides, random_task, surfaces
 from deploy.task_table import starts_to_solve
 
 CONFIG = Config()
@@ -181,7 +182,7 @@ def test_it_docks_from_a_sample_of_training_starts():
 
 
 def test_it_docks_from_a_sample_of_the_grid():
-    tasks = grid("validation", 1)[::25]
+    tasks = grid("quick", "validation").tasks[::25]
     endings = [drive(build_scene(task, WORLD), 200, task.cell).ending for task in tasks]
     assert endings == ["docked"] * len(tasks)
 
@@ -189,14 +190,14 @@ def test_it_docks_from_a_sample_of_the_grid():
 @pytest.mark.slow
 def test_it_docks_from_98_of_100_training_starts_in_the_simulator():
     tasks, limit = starts_to_solve(CONFIG, 500), WORLD.max_episode_steps
-    endings = evaluate(Scripted(CONFIG), tasks, processes=2, max_steps=limit)
-    assert endings.count("success") >= 0.98 * len(tasks)
+    drives = examine(Baseline("b0", CONFIG), tasks, 2, Terms(max_steps=limit))
+    assert [drive.ending for drive in drives].count("success") >= 0.98 * len(tasks)
 
 
 @pytest.mark.slow
 def test_it_docks_from_97_of_100_grid_starts_in_the_simulator():
-    endings = evaluate(Scripted(CONFIG), grid("validation", 1), processes=2)
-    assert endings.count("success") >= 0.97 * 968
+    drives = examine(Baseline("b0", CONFIG), grid("quick", "validation").tasks, 2)
+    assert [drive.ending for drive in drives].count("success") >= 0.97 * 968
 
 
 def test_the_simulator_agrees_with_the_model_of_it_used_here():

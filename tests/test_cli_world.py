@@ -9,20 +9,15 @@ import sys
 import av
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
-from actor.evaluation import Scripted
 from common.cells import CELLS, ROOMS
 from common.config import resolve
-from common.policy_files import CONFIG, NETWORKS, save_folder
-from common.tasks import GRID_HEADINGS, grid
-from deploy.cli.evaluate import by_heading, own_rules, summary
+from deploy.cli.evaluate import own_rules
 from tests.test_cli import call
 
 PLAIN = ("world.obstacles.count_min=0", "world.obstacles.count_max=0", 'world.randomization.fixed=["all"]')
 QUIET = tuple(f"world.randomization.{place}.camera_noise=[0, 0]" for place in ("training", "test"))
-Z2 = 1.959963984540054**2
 
 
 def preview(monkeypatch, capsys, out, *arguments) -> np.ndarray:
@@ -176,7 +171,7 @@ RECORD = ("world", "record", "--policy", "b0")
         (("evaluate", "b0", "--arena", "test"), "--arena says where a grid is; add --grid"),
         (
             ("world", "record", "--policy", ".", "--out", "x.mp4", "--set", "world.lidar.noise=1"),
-            "go with --policy b0",
+            "go with a baseline",
         ),
         (
             ("world", "preview", "--out", "p.png", "--cell", "all", "--steps", "3"),
@@ -184,7 +179,18 @@ RECORD = ("world", "record", "--policy", "b0")
         ),
         (("evaluate", "b0", "--grid", "quick", "--arena", "nowhere"), "arena 'nowhere' does not exist"),
         (("evaluate", "b0", "--grid", "long"), "'quick', 'paper'"),
-        (("evaluate", "b0", "--suite", "grid"), "suite 'grid' does not exist; choose one of short, train"),
+        (
+            ("evaluate", "b0", "--suite", "grid"),
+            "suite 'grid' does not exist; choose one of short, train, moving-dolly",
+        ),
+        (
+            ("evaluate", "b0", "--grid", "quick", "--nearest", "9"),
+            "the grid leaves the arena validation: the start -2.5, -9 m from the dolly lies outside",
+        ),
+        (("evaluate", "b0", "--nearest", "2"), "--nearest says where a grid is"),
+        (("evaluate", "b0", "b0"), "the same policy is named twice"),
+        (("evaluate", "b0", "b1", "--compare", "b2"), "--compare compares one policy with another"),
+        (("evaluate", "b0", "--out", "/proc/x"), "--out /proc/x cannot be made"),
         (("bench", "sim", "--rounds", "0"), "--rounds"),
         (("bench", "sim", "--preset", "quick"), "paper, fast, smoke"),
     ],
@@ -273,43 +279,6 @@ def test_check_draws_other_tasks_for_another_seed(monkeypatch, capsys):
     assert texts[0][1].startswith("| cell | distance (m) | ")
 
 
-def test_summary_has_the_rates_and_wilsons_interval():
-    found = summary(["success"] * 3 + ["timeout"] + ["dolly_contact"] * 4)
-    assert {key: found[key] for key in found if key != "ci95"} == {
-        "success": 0.375,
-        "dolly_contact": 0.5,
-        "other_contact": 0.0,
-        "timeout": 0.125,
-    }
-    for bound in found["ci95"]:  # both bounds lie z standard errors of their own from the rate
-        assert (0.375 - bound) ** 2 == pytest.approx(Z2 * bound * (1 - bound) / 8)
-    assert found["ci95"][0] < 0.375 < found["ci95"][1]
-    assert summary(["success"] * 10)["ci95"] == pytest.approx([10 / (10 + Z2), 1.0])
-    assert summary(["timeout"] * 10)["ci95"] == pytest.approx([0.0, Z2 / (10 + Z2)])
-
-
-def test_grid_is_summed_up_by_heading_and_by_whether_training_has_seen_it():
-    tasks = grid("validation", 2)
-    docks = {0: 242, 45: 121, -45: 0, 90: 60, -90: 0, 135: 242, -135: 0, 180: 2}
-    left = dict(docks)
-    endings = []
-    for task in tasks:
-        heading = round(task.start.yaw)
-        endings.append("success" if left[heading] else "timeout")
-        left[heading] -= left[heading] > 0
-    found = by_heading(tasks, endings)
-    assert set(found) == {"headings", "inside", "outside"}
-    assert list(found["headings"]) == [str(heading) for heading in GRID_HEADINGS]
-    for heading, count in docks.items():
-        assert found["headings"][str(heading)] == summary(["success"] * count + ["timeout"] * (242 - count))
-    assert found["inside"]["success"] == pytest.approx((242 + 121 + 60) / (5 * 242))
-    assert found["outside"]["success"] == pytest.approx((242 + 2) / (3 * 242))
-    assert found["inside"]["timeout"] == pytest.approx(1 - found["inside"]["success"])
-    low, high = found["outside"]["ci95"]
-    assert high - low < 0.08  # of all 726, not of a heading's 242
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-
-
 def test_bench_sim_reports_rows_ratios_what_it_skipped_and_the_host():
     done = run("bench", "sim", "--rounds", 1, "--preset", "smoke", "--json")
     assert done.returncode == 0, done.stderr
@@ -336,13 +305,12 @@ def test_bench_sim_reports_rows_ratios_what_it_skipped_and_the_host():
     assert found["host"]["cores"] == os.cpu_count()
 
 
-def test_what_is_special_in_a_policys_world_stands_beside_its_result(tmp_path):
+def test_what_is_special_in_a_policys_world_stands_beside_its_result():
     config = resolve("smoke", overrides=("world.reward.success_distance=3", "world.camera.size=32"))
-    save_folder(tmp_path / "policy", {CONFIG: config.to_toml()}, {NETWORKS: {"x": torch.zeros(1)}})
-    assert own_rules(tmp_path / "policy") == {
+    assert own_rules(config) == {
         "world.max_episode_steps": 20,
         "world.max_evaluation_steps": 20,
         "world.camera.size": 32,
         "world.reward.success_distance": 3.0,
     }
-    assert own_rules(Scripted(resolve())) == {}
+    assert own_rules(resolve()) == {}

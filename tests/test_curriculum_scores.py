@@ -450,7 +450,7 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
 
 NUMBERS = 'curriculum.parameters=[{name="x", low=0.0, high=8.0, easy=0.0}]'
 SETTINGS = ("--preset", "smoke", "--set", NUMBERS, "--set", "curriculum.gate.enabled=false")
-TASKS = 60
+TASKS = 150
 """In each life of the curriculum."""
 
 

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from actor.evaluation.suites import SUITES, grid, suite
 from actor.frames import PROBE_SETS, PROBE_STEPS, film, film_all, probe_tasks
 from actor.world.world import DockingWorld
 from common.cells import CELLS, ROOMS, arena_index
@@ -20,10 +21,8 @@ from common.tasks import (
     Task,
     build_scene,
     geometric_properties,
-    grid,
     narrowed_task,
     random_task,
-    suite,
 )
 from tests.helpers import in_frame, small_config
 
@@ -245,7 +244,8 @@ def test_probe_tasks_are_the_same_every_time_and_never_those_of_training_or_anot
     assert sets == {name: probe_tasks(name, config) for name in PROBE_SETS}
     assert list(sets) == ["fit", "training", "validation"]
     seeds = [task.seed for tasks in sets.values() for task in tasks]
-    taken = {t.seed for t in (*suite("short", config), *suite("train", config), *grid("validation", 2))}
+    examinations = (*map(suite, SUITES), grid("paper", "validation"), grid("paper", "test", seed=1))
+    taken = {task.seed for examination in examinations for task in examination.tasks}
     assert len(seeds) == len(set(seeds)) == 3 * config.pretraining.probe_drives
     assert min(seeds) >= FIRST_SUITE_SEED
     assert not taken & set(seeds)

@@ -294,7 +294,7 @@ CHANNELS = (
 
 @pytest.mark.parametrize("name", CHANNELS)
 def test_wrong_messages_are_refused_and_counted_and_leave_no_trace(client, target, name):
-    fuzz(client, target, name, 1_000)
+    fuzz(client, target, name, 2_000)
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ COMMANDS = {
     "top that waits": ("top", "--connect", "{hub}"),
     "train": ("train", "--run", "{run}", *SMOKE),
     "pretrain": ("pretrain", "--run", "{run}", "--preset", "smoke"),
-    "evaluate": ("evaluate", "b0", "--suite", "train"),
+    "evaluate": ("evaluate", "b0", "--suite", "train", "--work", "{run}.db"),
     "world check": ("world", "check", "--tasks", "10000"),
     "bench sim": ("bench", "sim", "--rounds", "50"),
     "bench learner": ("bench", "learner"),
@@ -63,6 +63,11 @@ def mark() -> Iterator[str]:
             continue
 
 
+def heed_ctrl_c() -> None:
+    """Tests that run in the background of a script ignore it, and so would what they start."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
     """Ctrl-C so many seconds after the start."""
     words = {"run": folder / uuid.uuid4().hex, "hub": free_endpoint(), "own": free_endpoint()}
@@ -74,6 +79,7 @@ def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
             stdout=file,
             stderr=file,
             start_new_session=True,
+            preexec_fn=heed_ctrl_c,
             env={**os.environ, MARK: mark, "HOME": str(folder)},
         )
     time.sleep(moment)

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from actor.evaluation.suites import suite
 from common import messages as m
-from common.config import GEOMETRIC, Config, resolve
+from common.config import GEOMETRIC, resolve
 from common.messages import MessageError, _to_array, decode, encode
 from common.observation import ObservationLayout
 from common.tasks import (
@@ -17,7 +18,6 @@ from common.tasks import (
     DollyShift,
     PlacedStart,
     Task,
-    suite,
 )
 from common.world_config import StartRanges
 from tests.helpers import tiny_episode
@@ -345,7 +345,7 @@ def test_task_in_an_arena_does_not_even_leave():
         ({"cell": 11}, r"Outcome\.task\.cell: Input should be less than 11"),
         ({"cell": "0x"}, r"Outcome\.task\.cell: "),
         ({"seed": 2**53}, r"Outcome\.task\.seed: "),
-        ({"seed": suite("train", Config())[7].seed}, r"Outcome\.task: .*examination's, from which nothing"),
+        ({"seed": suite("train").tasks[7].seed}, r"Outcome\.task: .*examination's, from which nothing"),
         ({"start": {"x": 1.0, "y": 2.0, "yaw": 3.0, "jitter": 0.5}}, r"Outcome\.task\.start"),
         ({"start": {"x": 1.0, "y": 2.0}}, r"Outcome\.task\.start"),
         ({"shift": {"step": 0}}, r"Outcome\.task\.shift\.step: "),

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from actor.evaluation import Examiner, evaluate, rates, wilson_interval
 from actor.inference import Eyes, PolicyActor
 from actor.rollout import Rollout
 from common.config import resolve
-from common.errors import UsageError
 from common.messages import Version
 from common.networks import Perception, Policy, make_encoder, state_of
 from common.observation import ObservationLayout, observe
 from common.policy_files import CONFIG, NETWORKS, save_folder
-from common.tasks import random_task, suite
+from common.tasks import random_task
 
 SMOKE = resolve("smoke")
 
@@ -125,26 +123,3 @@ def test_weights_of_another_architecture_are_refused_naming_the_tensor():
     actor = PolicyActor(SMOKE, 1, np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"policy\.net\.fusion\.bias"):
         actor.load(Version(epoch=1, counter=1), networks(other))
-
-
-def test_evaluation_gives_the_same_endings_alone_and_in_two_workers(tmp_path):
-    policy = save(SMOKE, tmp_path / "policy")
-    tasks = suite("short", SMOKE)[:14]
-    alone = Examiner(policy, greedy=True).run(tasks, np.random.default_rng(0))
-    done = []
-    assert evaluate(policy, tasks, processes=2, progress=done.append) == alone
-    assert done[-1] == 14
-    assert sum(rates(alone).values()) == pytest.approx(1.0)
-
-
-def test_evaluation_refuses_networks_that_do_not_fit_their_configuration(tmp_path):
-    other = resolve("smoke", overrides=("network.hidden=[16,16]",))
-    with pytest.raises(UsageError, match="holds other networks than its configuration says"):
-        evaluate(save(SMOKE, tmp_path / "policy", networks(other)), suite("short", SMOKE)[:1], processes=1)
-
-
-def test_wilson_interval_agrees_with_published_values():
-    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)  # Newcombe 1998, table I
-    assert wilson_interval(15, 148) == pytest.approx((0.0624, 0.1605), abs=1e-4)
-    assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
-    assert wilson_interval(29, 29) == pytest.approx((0.8830, 1.0), abs=1e-4)

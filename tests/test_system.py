@@ -200,7 +200,15 @@ def test_curriculum_alone_answers_queries_as_documented(processes, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
-    "arguments", [("--preset", "paper"), ("--variant", "rnd"), ("--variant", "e2e")], ids=lambda pair: pair[1]
+    "arguments",
+    [
+        ("--preset", "paper"),
+        ("--variant", "rnd"),
+        ("--variant", "e2e"),
+        ("--set", "world.lidar.range=1.5"),  # section 5.4
+        ("--set", "world.reward.dolly_contact=-10"),  # section 5.4
+    ],
+    ids=lambda pair: pair[1],
 )
 def test_preset_and_variants_train_for_two_minutes_with_finite_losses(tmp_path, arguments):
     # the paper's warm-up of 15,000 steps outlasts two minutes, so it is shortened here, for all alike

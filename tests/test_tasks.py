@@ -14,8 +14,6 @@ from common.config import GEOMETRIC, Config, FavourableRanges, resolve
 from common.errors import UsageError
 from common.geometry import SE2, Rectangle, bearing, rectangles_overlap
 from common.tasks import (
-    GRID_HEADINGS,
-    SUITES,
     DollyShift,
     GeometricProperties,
     Obstacle,
@@ -27,11 +25,9 @@ from common.tasks import (
     docking_corridor,
     dolly_sides,
     geometric_properties,
-    grid,
     obstacle_catalogue,
     random_stream,
     random_task,
-    suite,
 )
 from common.world_config import ObstacleConfig, StartRanges
 from curriculum.task_space import DOCKING_SCALES, make_space
@@ -394,62 +390,6 @@ def test_placed_start_may_be_behind_the_dolly_or_under_it():
     assert_no_contact(under, scene)
 
 
-def test_grid_has_every_start_of_section_4_2_once_in_each_repeat():
-    assert GRID_HEADINGS == (0, -45, 45, -90, 90, -135, 135, 180)
-    tasks = grid("validation", 1)
-    assert len(tasks) == 968
-    assert {task.cell for task in tasks} == {9}
-    starts = {(t.start.x, t.start.y, t.start.yaw) for t in tasks if isinstance(t.start, PlacedStart)}
-    steps = [0.5 * k for k in range(11)]
-    assert starts == {(-2.5 + dx, -1.5 - dy, yaw) for dx in steps for dy in steps for yaw in GRID_HEADINGS}
-    assert len(starts) == 968
-    assert len({(x, y) for x, y, _ in starts}) == 121
-    assert (min(x for x, *_ in starts), max(x for x, *_ in starts)) == (-2.5, 2.5)
-    assert (max(y for _, y, _ in starts), min(y for _, y, _ in starts)) == (-1.5, -6.5)
-    assert {task.cell for task in grid("test", 1)} == {10}
-    assert [t.start for t in grid("test", 2)] == [t.start for t in tasks] * 2
-
-
-def test_seeds_of_a_grid_are_its_own():
-    nine = [task.seed for task in grid("test", 9)]
-    assert len(nine) == len(set(nine)) == 8712
-    assert nine[:968] == [task.seed for task in grid("test", 1)], "one repeat is the first of nine"
-    assert nine == [task.seed for task in grid("test", 9)]
-    other = [task.seed for task in grid("test", 9, seed=1)]
-    suites = [task.seed for name in SUITES for task in suite(name, CONFIG)]
-    assert len({*nine, *other, *suites}) == 2 * 8712 + 500
-    assert min(nine) >= 2**32, "training draws none of them"
-
-
-@pytest.mark.parametrize("arena", ["validation", "test"])
-def test_all_starts_of_a_grid_are_free_and_where_they_should_be(arena):
-    for task in grid(arena, 1):
-        scene = build_scene(task, WORLD)
-        start, dolly = task.start, ROOMS[task.cell].dolly
-        assert isinstance(start, PlacedStart)
-        assert scene.dolly == dolly
-        assert (scene.robot.x - dolly.x, scene.robot.y - dolly.y) == pytest.approx((start.x, start.y))
-        assert math.remainder(math.degrees(scene.robot.yaw) - start.yaw, 360) == pytest.approx(0, abs=1e-9)
-        assert_no_contact(task, scene)
-        assert_corridor(task, scene)
-        assert_obstacles(task, scene)
-
-
-@pytest.mark.parametrize("arena", ["validation", "test"])
-def test_repeats_of_a_grid_differ_in_the_obstacles_and_never_in_the_start(arena):
-    tasks = grid(arena, 9)
-    for first in range(0, 968, 88):
-        repeats = [build_scene(task, WORLD) for task in tasks[first::968]]
-        assert len(repeats) == 9
-        assert len({scene.robot for scene in repeats}) == len({scene.dolly for scene in repeats}) == 1
-        assert len({scene.obstacles for scene in repeats}) == 9
-
-
-def test_unknown_arena_is_a_usage_error():
-    with pytest.raises(UsageError, match="arena 'hall' does not exist; choose one of validation, test"):
-        grid("hall", 1)
-
-
 # A dolly that moves
 
 
@@ -764,43 +704,6 @@ def test_properties_have_the_papers_four_first_and_the_configuration_names_them_
     assert names == GEOMETRIC
     task = Task(cell=3, seed=7, start=StartRanges())
     assert tuple(make_space(CONFIG).entry(task).properties) == GEOMETRIC == tuple(DOCKING_SCALES)
-
-
-def test_suites_have_their_sizes_cells_and_ranges():
-    assert SUITES == ("short", "train")
-    short, train = suite("short", CONFIG), suite("train", CONFIG)
-    assert (len(short), len(train)) == (100, 400)
-    assert {t.cell for t in short} == {t.cell for t in train} == set(range(9))
-    assert all(t.start == WORLD.start for t in train)
-    for task in short:
-        found = build_scene(task, WORLD)
-        properties = geometric_properties(task, found)
-        towards = bearing(SE2(found.robot.x, found.robot.y), found.dolly.x, found.dolly.y)
-        assert 1.5 - 1e-9 <= properties.distance <= 2.0 + 1e-9
-        assert abs(math.degrees(found.robot.yaw)) <= 20
-        assert abs(math.degrees(found.dolly.yaw)) <= 4
-        assert abs(math.degrees(towards)) <= 4 + 1e-9
-
-
-def test_suites_are_the_same_every_time_and_buildable():
-    assert suite("train", CONFIG) == suite("train", Config(seed=9))
-    for task in suite("train", CONFIG):
-        build_scene(task, WORLD)
-
-
-def test_training_never_draws_a_suites_seed():
-    suites = [task.seed for name in SUITES for task in suite(name, CONFIG)]
-    assert len(set(suites)) == 500
-    rng = np.random.default_rng(0)
-    drawn = [random_task(0, CONFIG, rng).seed for _ in range(500)]
-    drawn += [candidate_task(0, CONFIG, rng).seed for _ in range(500)]
-    assert len(set(drawn)) == 1000
-    assert max(drawn) < 2**32 <= min(suites)
-
-
-def test_unknown_suite_is_a_usage_error():
-    with pytest.raises(UsageError, match="suite 'lang' does not exist; choose one of short, train"):
-        suite("lang", CONFIG)
 
 
 def test_share_of_narrowed_candidates_is_the_configured_one():

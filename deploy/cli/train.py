@@ -12,18 +12,18 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from actor.evaluation.suites import suite
 from common.bus import Keys
-from common.config import Config, parse, resolve
+from common.config import Config, parse
 from common.contract import fetch_contract
 from common.errors import UsageError
 from common.link import make_link, open_client
 from common.members import Members
 from common.messages import ContractReply
 from common.resources import learner_threads
-from common.tasks import suite as suite_tasks
 from common.telemetry import exit_on_signals
 from deploy.cli import options
-from deploy.cli.evaluate import run_tasks
+from deploy.cli.evaluate import drive
 from deploy.launcher import Child, Supervisor, free_port
 from deploy.screen import Screen
 from deploy.troubles import number
@@ -57,7 +57,7 @@ def train(
     if not exists or any((preset, variant, config, settings, seed is not None)):
         options.configuration(preset, variant, config, settings, seed)
     if evaluation is not None:
-        suite_tasks(evaluation, options.configuration(None, None, None, None, None))
+        suite(evaluation)
     asked = _arguments(preset, variant, config, settings, seed)
     exit_on_signals()
     load = _supervise(run, minutes or 40.0, actors, f"tcp/127.0.0.1:{port or free_port()}", asked, source)
@@ -181,19 +181,21 @@ def _summary(run: Path, load: float) -> dict[str, Any]:
     }
 
 
-def _compare(run: Path, suite: str, seed: int) -> dict[str, Any]:
+def _compare(run: Path, name: str, seed: int) -> dict[str, Any]:
     """Untrained against trained policy on a suite, greedy; outside the training's clock."""
-    from actor.evaluation import rates
+    from actor.evaluation.examiner import Terms
+    from actor.evaluation.measures import rates
 
     policies = {"before": run / "snapshots" / "initial", "after": run / "snapshots" / "final"}
     if missing := [path for path in policies.values() if not path.exists()]:
         raise UsageError(f"{missing[0]} is missing: nothing to evaluate")
-    tasks = suite_tasks(suite, resolve())
+    examination = suite(name)
+    terms = Terms(seed=seed, overrides=examination.overrides)
     found = {
-        name: rates(run_tasks(path, tasks, None, f"{name} on {suite}", seed=seed))
-        for name, path in policies.items()
+        label: rates([one.ending for one in drive(path, examination, terms, label)])
+        for label, path in policies.items()
     }
-    return {"suite": suite, "episodes": len(tasks), **found}
+    return {"suite": name, "episodes": len(examination.tasks), **found}
 
 
 def _print_summary(result: dict[str, Any], run: Path) -> None:

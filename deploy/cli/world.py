@@ -94,14 +94,15 @@ def record(
     options.check_file("--out", out, ".mp4")
     if still:
         options.check_file("--still", still, ".png")
-    if policy != "b0" and (config or settings):
-        raise UsageError("--config and --set go with --policy b0; a trained policy brings its own world")
-    resolved = options.configuration(None, None, config, settings, None)
-    from actor.evaluation import load_driver
+    from actor.baseline import BASELINES
+    from actor.evaluation.examiner import Terms, load_driver
     from actor.recording import drive, write_video
-    from deploy.cli.evaluate import find_policy
+    from deploy.cli.evaluate import find_subject
 
-    rollout, actor = load_driver(find_policy(policy, resolved), not sampled, 1)
+    if policy not in BASELINES and (config or settings):
+        raise UsageError("--config and --set go with a baseline; a trained policy brings its own world")
+    subject = find_subject(policy, options.configuration(None, None, config, settings, None))
+    rollout, actor = load_driver(subject, Terms(greedy=not sampled), 1)
     world = rollout.worlds[0].config
     task = options.make_task(world, cell, seed, place, shift)
     kept: list[Image.Image] = []
@@ -141,7 +142,7 @@ def check(
     if out:
         options.check_file("--out", out, ".md")
     resolved = options.configuration(None, None, config, settings, seed)
-    from deploy.cli.evaluate import run_tasks
+    from deploy.cli.evaluate import drive
     from deploy.task_table import as_markdown, properties_of_cells, starts_to_solve
 
     with options.progress("tasks", len(CELLS) * tasks) as report:
@@ -150,9 +151,13 @@ def check(
     text = as_markdown(table)
     if solve:
         starts, limit = starts_to_solve(resolved, solve), resolved.world.max_episode_steps
-        from actor.evaluation import Scripted, rates
+        from actor.evaluation.examiner import Baseline, Terms
+        from actor.evaluation.measures import rates
+        from actor.evaluation.suites import Examination
 
-        found = rates(run_tasks(Scripted(resolved), starts, processes, "b0", max_steps=limit))
+        examination = Examination("training starts", tuple(starts))
+        drives = drive(Baseline("b0", resolved), examination, Terms(max_steps=limit), "b0", processes)
+        found = rates([one.ending for one in drives])
         result["solved"] = {"tasks": solve, "max_steps": limit, **found}
         text += (
             f"\nThe scripted controller (b0), {solve} more such tasks, at most {limit} steps: "
