@@ -42,11 +42,11 @@ def as_lines(results: dict[str, Result], paired: dict[str, Any] | None) -> str:
     if paired:
         low, high = (100 * bound for bound in paired["ci95"])
         first, points = next(iter(results)), f"{100 * paired['difference']:+.1f} points"
-        lines.append(
-            f"{first} less {paired['policy']}, in pairs: {points} (95% interval {low:+.1f} to {high:+.1f}), "
-            f"p = {paired['p_value']:.2g}; only the first docked {paired['only_ours']} times, only the second "
-            f"{paired['only_theirs']} times\n"
-        )
+        lines += [
+            f"{first} less {paired['policy']}, in pairs: {points} (95% interval {low:+.1f} to {high:+.1f}), ",
+            f"p = {paired['p_value']:.2g}; only the first docked {paired['only_ours']} times, only the second ",
+            f"{paired['only_theirs']} times\n",
+        ]
     elif len(results) > 1:
         lines.append(f"over {len(results)} policies, success in all rows: mean, standard deviation, range\n")
         for name, row in over_policies(list(results.values())).items():

@@ -184,8 +184,8 @@ RECORD = ("world", "record", "--policy", "b0")
             "suite 'grid' does not exist; choose one of short, train, moving-dolly",
         ),
         (
-            ("evaluate", "b0", "--grid", "quick", "--nearest", "9"),
-            "the grid leaves the arena validation: the start -2.5, -9 m from the dolly lies outside",
+            ("evaluate", "b0", "--grid", "quick", "--nearest", "9.2"),
+            "the grid leaves the arena validation: the start -2.5, -9.2 m from the dolly lies outside",
         ),
         (("evaluate", "b0", "--nearest", "2"), "--nearest says where a grid is"),
         (("evaluate", "b0", "b0"), "the same policy is named twice"),
