@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from types import FrameType
 
 import numpy as np
@@ -96,10 +97,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def exit_on_signals() -> None:
-    """Turns SIGTERM and SIGINT into SystemExit, once, so that sessions and files are closed on the way out.
-
-    Where Python ignores exceptions, in a callback of an import for example, a signal is given again.
-    """
+    """Turns SIGTERM and SIGINT into SystemExit, once, so that sessions and files are closed on leaving."""
     leaving = False
 
     def leave(number: int, frame: FrameType | None) -> None:
@@ -108,14 +106,31 @@ def exit_on_signals() -> None:
             leaving = True
             raise SystemExit(0)
 
-    def ignored(what: sys.UnraisableHookArgs) -> None:
+    def stay() -> None:
         nonlocal leaving
-        if isinstance(what.exc_value, SystemExit):
-            leaving = False
-            threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)).start()
-        else:
-            sys.__unraisablehook__(what)
+        leaving = False
 
-    sys.unraisablehook = ignored
+    give_again(SystemExit, signal.SIGTERM, stay)
     signal.signal(signal.SIGTERM, leave)
     signal.signal(signal.SIGINT, leave)
+
+
+_again: dict[type[BaseException], tuple[int, Callable[[], None]]] = {}
+
+
+def give_again(error: type[BaseException], number: int, before: Callable[[], None] = lambda: None) -> None:
+    """Where Python ignores exceptions, in a callback of an import for example, a signal's is not lost.
+
+    The signal `number`, whose handler raised `error`, is given again a moment later.
+    """
+    _again[error] = number, before
+    sys.unraisablehook = _unraisable
+
+
+def _unraisable(what: sys.UnraisableHookArgs) -> None:
+    if what.exc_type not in _again:
+        sys.__unraisablehook__(what)
+        return
+    number, before = _again[what.exc_type]
+    before()
+    threading.Timer(0.05, os.kill, (os.getpid(), number)).start()

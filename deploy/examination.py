@@ -44,7 +44,7 @@ def as_lines(results: dict[str, Result], paired: dict[str, Any] | None) -> str:
         first, points = next(iter(results)), f"{100 * paired['difference']:+.1f} points"
         lines += [
             f"{first} less {paired['policy']}, in pairs: {points} (95% interval {low:+.1f} to {high:+.1f}), ",
-            f"p = {paired['p_value']:.2g}; only the first docked {paired['only_ours']} times, only the second ",
+            f"p = {paired['p_value']:.2g}; the first alone docked {paired['only_ours']} times, the second ",
             f"{paired['only_theirs']} times\n",
         ]
     elif len(results) > 1:

@@ -86,6 +86,10 @@ def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
     early = process.poll()
     if early is None:
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all that have not left its group
+        time.sleep(0.5)
+        if b"Exception ignored" in output.read_bytes():
+            # the interpreter loses it in its own imports, before any of our lines runs; people press it again
+            os.killpg(process.pid, signal.SIGINT)
     began = time.monotonic()
     try:
         process.wait(SOON * PATIENCE)

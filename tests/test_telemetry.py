@@ -64,12 +64,24 @@ finally:
 """
 
 
+BEFORE = """
+from common.telemetry import give_again
+give_again(KeyboardInterrupt, signal.SIGINT)
+"""
+
+
 def test_a_signal_that_comes_where_python_ignores_exceptions_is_not_lost():
     """As in an import's callbacks, for the first seconds of every command."""
-    found = subprocess.run(
-        [sys.executable, "-c", IN_A_CALLBACK], capture_output=True, cwd=Path(__file__).parents[1], timeout=25
-    )
-    assert (found.returncode, found.stdout, found.stderr) == (0, b"ignored\nclosed\n", b"")
+
+    def run(script):
+        command, folder = [sys.executable, "-c", script], Path(__file__).parents[1]
+        found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25)
+        return found.returncode, found.stdout, found.stderr
+
+    assert run(IN_A_CALLBACK) == (0, b"ignored\nclosed\n", b"")
+    code, out, err = run(IN_A_CALLBACK.replace("exit_on_signals()", BEFORE))
+    assert (code, out) == (-signal.SIGINT, b"ignored\nclosed\n")
+    assert err.endswith(b"KeyboardInterrupt\n")
 
 
 def test_figures_are_due_at_once_and_then_not_again_within_the_second(hub, client):

@@ -11,6 +11,7 @@ from typer.exceptions import TyperException
 
 from common.errors import NoAnswerError, RefusedError, RunError, UsageError
 from common.messages import MessageError
+from common.telemetry import give_again
 from deploy.cli import (
     bench,
     certs,
@@ -49,6 +50,7 @@ app.add_typer(certs.app, name="certs")
 
 def run() -> NoReturn:
     """Runs a command and exits: 0 on success, 2 on wrong use with one sentence, 1 on failure."""
+    give_again(KeyboardInterrupt, signal.SIGINT)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code = app(standalone_mode=False)
