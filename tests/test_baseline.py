@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from actor.baseline.docking import ScriptedController, approach
+from actor.baseline.docking import ScriptedController
 from actor.baseline.planning import plan
+from actor.baseline.tracking import approach
 from actor.evaluation import Scripted, evaluate
 from actor.world.world import DockingWorld
 from common.cells import Box
@@ -37,7 +38,7 @@ def crate(x, y, half_x, half_y):
 
 def drive(scene, steps, cell=0, dolly_at=None, push_at=None):
     """Runs the controller; `dolly_at(step)` moves the dolly, `push_at(step, pose)` the robot."""
-    controller = ScriptedController(WORLD, cell, scene)
+    controller = ScriptedController(WORLD, surfaces(cell, scene))
     pose, wheels, run = scene.robot, np.zeros(2), Run()
     dt = WORLD.control_period / WORLD.substeps
     for step in range(steps):
@@ -206,7 +207,7 @@ def test_the_simulator_agrees_with_the_model_of_it_used_here():
     for index in range(9):
         task = random_task(index, CONFIG, rng)
         world.place(task)
-        controller, ending = ScriptedController(WORLD, task.cell, world.scene), None
+        controller, ending = ScriptedController(WORLD, surfaces(task.cell, world.scene)), None
         while ending is None:
             _, ending = world.advance(controller.act(world.pose, world.dolly, world.speeds))
         run = drive(build_scene(task, WORLD), 100, task.cell)
