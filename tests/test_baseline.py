@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from actor.baseline.docking import ScriptedController, approach
+from actor.baseline.docking import ScriptedController
 from actor.baseline.planning import plan
-from actor.evaluation.examiner import Baseline, Terms, examine
+from actor.baseline.tracking import approach
+from actor.evaluation.examiner import Rival, Terms, examine
 from actor.evaluation.suites import grid
 from actor.world.world import DockingWorld
 from common.cells import Box
@@ -38,7 +39,7 @@ def crate(x, y, half_x, half_y):
 
 def drive(scene, steps, cell=0, dolly_at=None, push_at=None):
     """Runs the controller; `dolly_at(step)` moves the dolly, `push_at(step, pose)` the robot."""
-    controller = ScriptedController(WORLD, cell, scene)
+    controller = ScriptedController(WORLD, surfaces(cell, scene))
     pose, wheels, run = scene.robot, np.zeros(2), Run()
     dt = WORLD.control_period / WORLD.substeps
     for step in range(steps):
@@ -190,13 +191,13 @@ def test_it_docks_from_a_sample_of_the_grid():
 @pytest.mark.slow
 def test_it_docks_from_98_of_100_training_starts_in_the_simulator():
     tasks, limit = starts_to_solve(CONFIG, 500), WORLD.max_episode_steps
-    drives = examine(Baseline("b0", CONFIG), tasks, 2, Terms(max_steps=limit))
+    drives = examine(Rival("b0", CONFIG), tasks, 2, Terms(max_steps=limit))
     assert [drive.ending for drive in drives].count("success") >= 0.98 * len(tasks)
 
 
 @pytest.mark.slow
 def test_it_docks_from_97_of_100_grid_starts_in_the_simulator():
-    drives = examine(Baseline("b0", CONFIG), grid("quick", "validation").tasks, 2)
+    drives = examine(Rival("b0", CONFIG), grid("quick", "validation").tasks, 2)
     assert [drive.ending for drive in drives].count("success") >= 0.97 * 968
 
 
@@ -207,7 +208,7 @@ def test_the_simulator_agrees_with_the_model_of_it_used_here():
     for index in range(9):
         task = random_task(index, CONFIG, rng)
         world.place(task)
-        controller, ending = ScriptedController(WORLD, task.cell, world.scene), None
+        controller, ending = ScriptedController(WORLD, surfaces(task.cell, world.scene)), None
         while ending is None:
             _, ending = world.advance(controller.act(world.pose, world.dolly, world.speeds))
         run = drive(build_scene(task, WORLD), 100, task.cell)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actor.evaluation.examiner import Baseline, Examiner, Terms, examine, identity
+from actor.evaluation.examiner import Rival, Examiner, Terms, examine, identity
 from actor.evaluation.measures import (
     Drive,
     axis_angle,
@@ -140,7 +140,7 @@ def test_yaw_tolerance_is_where_the_rectangle_no_longer_fits():
 
 def test_no_real_drive_beats_the_lower_bounds():
     tasks = grid("quick", "validation").tasks[3::44]
-    for drive in examine(Baseline("b0", CONFIG), tasks, 1):
+    for drive in examine(Rival("b0", CONFIG), tasks, 1):
         start = SE2(*drive.track[0, :3].tolist())
         found = measure(drive, WORLD)
         assert drive.ending == "success"
@@ -308,7 +308,7 @@ def test_drives_are_the_same_to_the_bit_on_one_worker_or_two_and_after_an_interr
 
 def test_track_begins_at_the_start_and_follows_the_robot():
     tasks = suite("short").tasks[:3]
-    drives = Examiner(Baseline("b0", CONFIG), Terms()).run(tasks, np.random.default_rng(0))
+    drives = Examiner(Rival("b0", CONFIG), Terms()).run(tasks, np.random.default_rng(0))
     for drive in drives:
         distance = math.hypot(drive.dolly.x - drive.track[-1, 0], drive.dolly.y - drive.track[-1, 1])
         assert drive.ending == "success"
@@ -329,7 +329,7 @@ def test_identity_is_that_of_the_content(tmp_path):
     one, two = save(SMOKE, tmp_path / "a"), save(SMOKE, tmp_path / "b")
     other = save(SMOKE, tmp_path / "c", networks(SMOKE, seed=1))
     assert identity(one) == identity(two) != identity(other)
-    assert identity(Baseline("b0", CONFIG)) != identity(Baseline("b0", SMOKE))
+    assert identity(Rival("b0", CONFIG)) != identity(Rival("b0", SMOKE))
 
 
 def test_what_depends_on_other_things_is_not_mixed_up(tmp_path):

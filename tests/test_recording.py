@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from actor.evaluation.examiner import Baseline, Terms, load_driver
+from actor.evaluation.examiner import Rival, Terms, load_driver
 from actor.recording import drive, write_video
 from common.config import resolve
 from common.errors import UsageError
@@ -26,7 +26,7 @@ LONG = 120
 @pytest.fixture(scope="module")
 def docking():
     """Frames and endings of a short drive, and the number of its steps."""
-    rollout, actor = load_driver(Baseline("b0", CONFIG), Terms(max_steps=200), 1)
+    rollout, actor = load_driver(Rival("b0", CONFIG), Terms(max_steps=200), 1)
     drawn = list(drive(rollout, actor, Task(cell=0, seed=1, start=NEAR)))
     yield [frame for frame, _ in drawn], [ending for _, ending in drawn], rollout.worlds[0].steps
     rollout.close()
@@ -62,7 +62,7 @@ def test_frame_shows_what_the_camera_saw(docking):
 
 
 def test_drive_that_runs_out_of_time_says_so():
-    rollout, actor = load_driver(Baseline("b0", CONFIG), Terms(max_steps=2), 1)
+    rollout, actor = load_driver(Rival("b0", CONFIG), Terms(max_steps=2), 1)
     try:
         far = Task(cell=0, seed=1, start=PlacedStart(x=0.0, y=-4.0, yaw=0.0))
         assert [ending for _, ending in drive(rollout, actor, far)] == [None, None, "timeout"]

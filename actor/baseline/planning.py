@@ -32,13 +32,15 @@ TOUCHING = 0.01
 HEADINGS = np.arange(16) * (math.tau / 16)
 NUDGES = np.array([-0.12, 0.0, 0.12])
 LENGTHS = np.array([-2.4, -1.2, -0.6, -0.3, -0.15, 0.15, 0.3, 0.6, 1.2, 2.4])
-"""Turns (rad, in the dolly's frame) and drives (m) of which the search makes its detours."""
+"""Turns (rad, about the dolly's yaw) and drives (m) of which the search makes its detours."""
 COARSE = 0.25
 """Where the robot can turn, the search takes poses nearer than this in x and y for one, m."""
 FINE = 0.2, 0.3
 """The same elsewhere, m, and for headings, rad."""
 SPACING = 0.2
 """Spacing of the points between which the time to go is mapped, m."""
+SMALL = 0.1
+"""Solids with a smaller half diagonal are points to the map of the time to go, m."""
 GREED = 1.5
 """Weight of the estimated time to go; above 1 the search is faster and its path up to this factor slower."""
 EXPANSIONS = 1500
@@ -46,14 +48,25 @@ EXPANSIONS = 1500
 
 
 class FreeSpace:
-    """What the robot must not touch, and how near it may come: `MARGIN` or half of what `start` has."""
+    """What the robot must not touch, and how near it may come: `margin` (m) or half of what `start` has.
 
-    def __init__(self, solids: Sequence[Rectangle], dolly: SE2, start: SE2, world: WorldConfig) -> None:
+    A start that overlaps something, which only solids measured too large can, may stay as deep in it.
+    """
+
+    def __init__(
+        self,
+        solids: Sequence[Rectangle],
+        dolly: SE2 | None,
+        start: SE2,
+        world: WorldConfig,
+        margin: float = MARGIN,
+    ) -> None:
         self._half = world.robot.width / 2, world.robot.length / 2
         self._surfaces = len(solids)
-        self.solids = as_rows([*solids, *dolly_sides(dolly, world)])
+        self.solids = as_rows([*solids, *(dolly_sides(dolly, world) if dolly else ())])
+        self._radii = np.hypot(self.solids[:, 3], self.solids[:, 4]) + 2 * margin
         gaps = separations(_row(start), self._half, self.solids)[0]
-        self._margins = np.clip(gaps / 2, 0.0, MARGIN)
+        self._margins = np.where(gaps < 0, gaps - TOUCHING, np.clip(gaps / 2, 0.0, margin))
 
     def can_turn(self, pose: SE2, yaw: float) -> bool:
         """Whether a turn on the spot to `yaw` (rad), the shorter way round, touches nothing."""
@@ -62,14 +75,33 @@ class FreeSpace:
             return True
         poses = np.repeat(_row(pose), 2 + int(abs(turn) / 0.05), axis=0)
         poses[:, 2] += np.linspace(0.0, turn, len(poses))
-        return bool((separations(poses, self._half, self.solids) >= self._margins).all())
+        near = self._near(pose, self._half)
+        return bool((separations(poses, self._half, self.solids[near]) >= self._margins[near]).all())
 
     def can_drive(self, pose: SE2, length: float, docking: bool = False) -> bool:
         """Whether driving straight for `length` (m) touches nothing; `docking` leaves the dolly out."""
-        count = self._surfaces if docking else len(self.solids)
         swept = self._half[0], self._half[1] + abs(length) / 2
-        gaps = separations(_row(pose @ SE2(0.0, length / 2)), swept, self.solids[:count])
-        return bool((gaps >= self._margins[:count]).all())
+        middle = pose @ SE2(0.0, length / 2)
+        near = self._near(middle, swept)
+        if docking:
+            near = near[near < self._surfaces]
+        return bool((separations(_row(middle), swept, self.solids[near]) >= self._margins[near]).all())
+
+    def is_free(self, path: Sequence[SE2], docking: bool) -> bool:
+        """Whether a path's turns and drives touch nothing; with `docking` the last drive may the dolly."""
+        for count, (a, b) in enumerate(itertools.pairwise(path), 2):
+            last = docking and count == len(path)
+            if not (self.can_turn(a, b.yaw) if a.yaw != b.yaw else self._can_reach(a, b, last)):
+                return False
+        return True
+
+    def _can_reach(self, a: SE2, b: SE2, docking: bool) -> bool:
+        return self.can_drive(a, (a.inverse() @ b).y, docking)
+
+    def _near(self, pose: SE2, half: tuple[float, float]) -> NDArray[np.int64]:
+        """The solids that a rectangle of half extents `half` at `pose` may come too near to."""
+        apart = np.hypot(self.solids[:, 0] - pose.x, self.solids[:, 1] - pose.y)
+        return np.flatnonzero(apart < self._radii + math.hypot(*half))
 
 
 class Raster:
@@ -78,12 +110,14 @@ class Raster:
     It only guides: what is free is decided by `FreeSpace`.
     """
 
-    def __init__(self, solids: Array) -> None:
-        self._low = solids[:, :2].min(axis=0)  # of the walls' middles: the outline's
-        self._shape = (2 + (solids[:, :2].max(axis=0) - self._low) / SPACING).astype(int)
+    def __init__(self, solids: Array, places: Array) -> None:
+        """A map that covers the middles of the solids (M, 5), so the room, and the places (N, 2)."""
+        covered = np.vstack([solids[:, :2], places])
+        self._low = covered.min(axis=0)
+        self._shape = (2 + (covered.max(axis=0) - self._low) / SPACING).astype(int)
         points = np.zeros((*self._shape, 3))
         points[..., :2] = self._low + SPACING * np.moveaxis(np.indices(self._shape), 0, -1)
-        self._gaps = separations(points.reshape(-1, 3), (0.0, 0.0), solids).min(axis=1).reshape(self._shape)
+        self._gaps = _gaps(points.reshape(-1, 3), solids).reshape(self._shape)
         self._times = np.zeros(self._shape)
 
     def set_times(self, places: Array, times: Array, radius: float) -> None:
@@ -98,6 +132,11 @@ class Raster:
                 near = field[1 + i : field.shape[0] - 1 + i, 1 + j : field.shape[1] - 1 + j]
                 np.minimum(inner, near + SPACING * math.hypot(i, j), out=inner, where=self._gaps > radius)
         self._times = np.where(np.isfinite(inner), inner, 2 * inner[np.isfinite(inner)].max())
+
+    def covers(self, positions: Array) -> NDArray[np.bool_]:
+        """Which positions (N, 2) lie on the map."""
+        index = (positions - self._low) / SPACING
+        return np.asarray(((index >= 0) & (index <= np.array(self._shape) - 1)).all(axis=-1))
 
     def gaps(self, positions: Array) -> Array:
         """Distances to the nearest solid (m) of positions (..., 2)."""
@@ -152,17 +191,24 @@ def plan(start: SE2, dolly: SE2, solids: Sequence[Rectangle], world: WorldConfig
     """A quick free path from `start` to the place under the dolly; empty when none was found."""
     space = FreeSpace(solids, dolly, start, world)
     ways_in = entries(start, dolly, space)
-    return _Search(dolly, space, ways_in, world.robot).run(start) if ways_in else []
+    return _Search(dolly.yaw, space, ways_in, world.robot).run(start) if ways_in else []
+
+
+def plan_to(start: SE2, goals: Sequence[SE2], solids: Sequence[Rectangle], world: WorldConfig) -> list[SE2]:
+    """A quick free path from `start` to that goal which is the soonest reached; empty when none was found."""
+    space = FreeSpace(solids, None, start, world)
+    ends = [Entry(goal, 0.0, 0.0) for goal in goals]
+    return _Search(start.yaw, space, ends, world.robot).run(start)[:-1] if ends else []
 
 
 class _Search:
     """A* over turns and drives; whether a move is free is asked only when its turn comes."""
 
-    def __init__(self, dolly: SE2, space: FreeSpace, ways_in: list[Entry], robot: RobotConfig) -> None:
-        self._dolly, self._space, self._ways_in = dolly, space, ways_in
+    def __init__(self, yaw: float, space: FreeSpace, ways_in: list[Entry], robot: RobotConfig) -> None:
+        self._yaw, self._space, self._ways_in = yaw, space, ways_in
         self._goals = np.array([(e.pose.x, e.pose.y, e.pose.yaw) for e in ways_in])
         self._times = np.array([e.time for e in ways_in])
-        self._raster = Raster(space.solids)
+        self._raster = Raster(space.solids, self._goals[:, :2])
         self._raster.set_times(self._goals[:, :2], self._times, robot.width / 2)
         self._narrow = robot.width / 2 - SPACING / 2
         self._turning = math.hypot(robot.width, robot.length) / 2 + MARGIN
@@ -197,7 +243,7 @@ class _Search:
             for way in range(2):
                 total = spent + times[i][way] + entry.time
                 self._queue(total, headings[i][way], lengths[i][way], entry, total)
-        ends, drives, more = _detours(pose, self._dolly.yaw)
+        ends, drives, more = _detours(pose, self._yaw)
         kept = self._raster.are_open(pose[:, :2], ends[:, :2], self._narrow)
         kept &= [key not in self._seen for key in self._keys(ends)]
         ends, drives, totals = ends[kept], drives[kept], spent + more[kept]
@@ -225,8 +271,18 @@ class _Search:
         """What the search takes for one pose: headings count where the robot cannot turn."""
         tight = self._raster.gaps(poses[:, :2]) < self._turning
         x, y = np.rint(poses[:, :2].T / np.where(tight, FINE[0], COARSE)).astype(int)
-        heading = np.where(tight, np.rint(_wrap(poses[:, 2] - self._dolly.yaw) / FINE[1]), 99).astype(int)
+        heading = np.where(tight, np.rint(_wrap(poses[:, 2] - self._yaw) / FINE[1]), 99).astype(int)
         return list(zip(x.tolist(), y.tolist(), heading.tolist(), strict=True))
+
+
+def _gaps(points: Array, solids: Array) -> Array:
+    """(N,) distances (m) from points (N, 3), whose yaw is 0, to the nearest of the solids (M, 5)."""
+    small = np.hypot(solids[:, 3], solids[:, 4]) < SMALL
+    gaps = separations(points, (0.0, 0.0), solids[~small]).min(axis=1, initial=np.inf)
+    if small.any():  # measured ones, which are many
+        x, y = (points[:, None, k] - solids[small, k] for k in range(2))
+        gaps = np.minimum(gaps, np.sqrt((x * x + y * y).min(axis=1)) - SMALL / 2)
+    return np.asarray(gaps)
 
 
 def _row(pose: SE2) -> Array:
@@ -258,10 +314,10 @@ def _reaches(poses: Array, goals: Array) -> tuple[Array, Array, Array]:
     return headings, lengths, _move_time(turns[0]) + _move_time(lengths) + _move_time(turns[1])
 
 
-def _detours(pose: Array, dolly_yaw: float) -> tuple[Array, Array, Array]:
+def _detours(pose: Array, yaw: float) -> tuple[Array, Array, Array]:
     """Turns and drives from a pose (1, 3): the poses (N, 3), lengths (m) and times (s)."""
     yaws, lengths = (
-        grid.ravel() for grid in np.meshgrid(np.append(HEADINGS + dolly_yaw, pose[0, 2] + NUDGES), LENGTHS)
+        grid.ravel() for grid in np.meshgrid(np.append(HEADINGS + yaw, pose[0, 2] + NUDGES), LENGTHS)
     )
     x, y = pose[0, 0] - lengths * np.sin(yaws), pose[0, 1] + lengths * np.cos(yaws)
     times = _move_time(_wrap(yaws - pose[0, 2])) + _move_time(lengths)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from actor.baseline.docking import ScriptedController
 from actor.world.world import DockingWorld
 from common.observation import Observation
+from common.tasks import surfaces
 
 
 class ScriptedActor:
@@ -25,6 +26,7 @@ class ScriptedActor:
         for slot in slots:
             world = self._worlds[slot]
             if world.steps == 0:
-                self._controllers[slot] = ScriptedController(world.config, world.task.cell, world.scene)
+                solids = surfaces(world.task.cell, world.scene)
+                self._controllers[slot] = ScriptedController(world.config, solids)
             actions.append(self._controllers[slot].act(world.pose, world.dolly, world.speeds))
         return np.array(actions, np.float32)

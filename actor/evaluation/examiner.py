@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from actor.baseline import make_baseline
+from actor.baseline.registry import make_baseline
 from actor.evaluation.measures import Drive
 from actor.evaluation.work_list import WorkList
 from actor.inference import Actor, Blind, Eyes, PolicyActor
@@ -32,8 +32,8 @@ SLOTS = len(CELLS)
 
 
 @dataclass(frozen=True, slots=True)
-class Baseline:
-    """Stands for a policy: a classical controller, by its name in `BASELINES`, in the world of `config`."""
+class Rival:
+    """Stands for a policy: a baseline by its name, in the world of `config`."""
 
     name: str
     config: Config
@@ -42,7 +42,7 @@ class Baseline:
         return self.name
 
 
-Subject = Path | Baseline
+Subject = Path | Rival
 """Who is examined: the folder of a policy, or a baseline."""
 
 
@@ -61,13 +61,13 @@ class Terms:
 
 def world_of(subject: Subject, terms: Terms = Terms()) -> Config:
     """The configuration in which a subject drives; raises UsageError when there is none."""
-    config = subject.config if isinstance(subject, Baseline) else load_policy(subject)[0]
+    config = subject.config if isinstance(subject, Rival) else load_policy(subject)[0]
     return override(config.model_dump(mode="json"), terms.overrides) if terms.overrides else config
 
 
 def identity(subject: Subject) -> str:
     """What a subject is by its content: a hash of a policy's files, or a baseline's name and world."""
-    if isinstance(subject, Baseline):
+    if isinstance(subject, Rival):
         return f"{subject.name} {content_hash(subject.config.to_toml().encode())}"
     load_policy(subject)  # or a missing or damaged file would have no sentence
     return content_hash((subject / CONFIG).read_bytes() + (subject / NETWORKS).read_bytes())
@@ -77,7 +77,7 @@ def load_driver(subject: Subject, terms: Terms, slots: int) -> tuple[Rollout, Ac
     """Worlds and what drives in them; raises UsageError when `subject` is no policy, or damaged."""
     config = world_of(subject, terms)
     limit = terms.max_steps or config.world.max_evaluation_steps
-    if isinstance(subject, Baseline):
+    if isinstance(subject, Rival):
         rollout = Rollout(config, Blind(config), slots, limit)
         return rollout, make_baseline(subject.name, rollout)
     encoder, tensors = make_encoder(config), load_policy(subject)[1]

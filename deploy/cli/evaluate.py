@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from actor.evaluation.suites import NEAREST, SUITES, Examination, grid, suite
-from common.config import Config, differing_keys, override, resolve
+from common.config import Config, differing_keys, resolve
 from common.errors import UsageError
 from common.version import code_version
 from deploy.cli import options
@@ -30,11 +30,11 @@ def find_subject(name: str, config: Config) -> Subject:
 
     A baseline drives in the world of `config`, with the sensors that it asks for.
     """
-    from actor.baseline import BASELINES
-    from actor.evaluation.examiner import Baseline
+    from actor.baseline.registry import BASELINES
+    from actor.evaluation.examiner import Rival
 
     if name in BASELINES:
-        return Baseline(name, override(config.model_dump(mode="json"), BASELINES[name]))
+        return Rival(name, BASELINES[name].configure(config))
     if name == "shipped":
         return Path(str(resources.files("common") / "policies" / "shipped"))
     path = Path(name)
@@ -166,7 +166,7 @@ def evaluate(
         check_starts(examination)
     else:
         examination = suite(suite_name or "train")
-    from actor.evaluation.examiner import Baseline, Terms, world_of
+    from actor.evaluation.examiner import Rival, Terms, world_of
     from actor.evaluation.measures import measure, paired_difference
     from actor.evaluation.report import groups
     from deploy.examination import as_json_object, as_lines, write_report
@@ -179,7 +179,7 @@ def evaluate(
     results: dict[str, dict[str, Any]] = {}
     rows = {}
     for label, subject in zip(labels, subjects, strict=True):
-        overrides = () if isinstance(subject, Baseline) else examination.overrides
+        overrides = () if isinstance(subject, Rival) else examination.overrides
         terms = Terms(not sampled, seed, overrides)
         config = world_of(subject, terms)
         kept = work or work_file(subject)

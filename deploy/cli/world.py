@@ -94,7 +94,7 @@ def record(
     options.check_file("--out", out, ".mp4")
     if still:
         options.check_file("--still", still, ".png")
-    from actor.baseline import BASELINES
+    from actor.baseline.registry import BASELINES
     from actor.evaluation.examiner import Terms, load_driver
     from actor.recording import drive, write_video
     from deploy.cli.evaluate import find_subject
@@ -151,12 +151,12 @@ def check(
     text = as_markdown(table)
     if solve:
         starts, limit = starts_to_solve(resolved, solve), resolved.world.max_episode_steps
-        from actor.evaluation.examiner import Baseline, Terms
+        from actor.evaluation.examiner import Rival, Terms
         from actor.evaluation.measures import rates
         from actor.evaluation.suites import Examination
 
         examination = Examination("training starts", tuple(starts))
-        drives = drive(Baseline("b0", resolved), examination, Terms(max_steps=limit), "b0", processes)
+        drives = drive(Rival("b0", resolved), examination, Terms(max_steps=limit), "b0", processes)
         found = rates([one.ending for one in drives])
         result["solved"] = {"tasks": solve, "max_steps": limit, **found}
         text += (
