@@ -14,7 +14,6 @@ from statistics import median
 from typing import Annotated
 
 import numpy as np
-import torch
 import typer
 
 from common.config import Config, resolve
@@ -64,7 +63,6 @@ def main(
     only: Annotated[str, typer.Option(help="Rows whose name contains this.")] = "",
 ) -> None:
     """Prints the table as Markdown; progress on stderr."""
-    torch.set_num_threads(1)
     print("| algorithm | tasks to 90%: median | of each seed | Brier score over the best |")
     print("|---|---|---|---|")
     for name, (variant, overrides) in ROWS.items():
