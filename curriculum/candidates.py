@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -134,14 +134,21 @@ class Cell:
         wanted = (version.epoch, version.counter)
         return np.asarray(self.table.row[(self.table.version != wanted).any(axis=1)])
 
-    def observed(self, rows: Sequence[int], read: Callable[[int], Candidate]) -> dict[int, Candidate]:
-        """Start observations of those that are still there; `read` gets one that is not at hand."""
-        for row in rows:
-            if row in self._texts and row not in self._observed:
-                self._observed[row] = read(row)
-        return {row: self._observed[row] for row in rows if row in self._texts}
+    def unread(self, rows: Sequence[int]) -> list[int]:
+        """Those that are there without their start observation at hand."""
+        return [row for row in rows if row in self._texts and row not in self._observed]
+
+    def observe(self, found: Mapping[int, Candidate]) -> None:
+        """Keeps start observations at hand of those that are still there."""
+        self._observed.update((row, start) for row, start in found.items() if row in self._texts)
+
+    def observed(self, rows: Sequence[int]) -> dict[int, Candidate]:
+        """Start observations that are at hand."""
+        return {row: self._observed[row] for row in rows if row in self._observed}
 
     def value(self, rows: Sequence[int], q: NDArray[np.float64], version: NDArray[np.int64]) -> None:
-        """Notes Q (M,) and its weights (M, 2), or (2,) for all, of some of those that are there."""
-        slots = np.searchsorted(self.table.row, rows)
-        self.table.q[slots], self.table.version[slots] = q, version
+        """Notes Q (M,) and its weights (M, 2), or (2,) for all, of those that are there."""
+        there = np.isin(rows, self.table.row)
+        slots = np.searchsorted(self.table.row, np.asarray(rows, np.int64)[there])
+        self.table.q[slots] = q[there]
+        self.table.version[slots] = np.broadcast_to(version, (len(there), 2))[there]

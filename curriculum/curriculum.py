@@ -9,7 +9,7 @@ import time
 import uuid
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from common.config import Config
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
 from common.messages import (
+    Candidate,
     Candidates,
     MessageError,
     Origin,
@@ -29,6 +30,7 @@ from common.messages import (
     Scores,
     Snapshot,
     Version,
+    decode,
 )
 from common.observation import ObservationLayout
 from curriculum.algorithms import make_algorithm
@@ -134,8 +136,7 @@ class Curriculum:
             for row in leases.keys() & set(cell.table.row.tolist()):
                 cell.lend(row, leases[row])
             if known:
-                there = np.isin(known["row"], cell.table.row)
-                cell.value(known["row"][there].tolist(), known["q"][there], known["version"][there])
+                cell.value(known["row"].tolist(), known["q"], known["version"])
         self.seen = self.database.origins()
 
     @property
@@ -347,13 +348,20 @@ class Curriculum:
         found = [(cell, cell.stale(self.version).tolist()) for cell in self.cells]
         return [(cell, rows[i : i + size]) for cell, rows in found for i in range(0, len(rows), size)]
 
-    def refresh(self, cell: Cell, rows: list[int]) -> None:
-        """Renews Q of candidates, those of them that are still there."""
-        assert self._critic is not None and self.version is not None
-        observed = cell.observed(rows, self.database.observed)
-        if observed:
-            version = np.array([self.version.epoch, self.version.counter])
-            cell.value(list(observed), self._critic.value(list(observed.values())), version)
+    def refresh(self, cell: Cell, rows: list[int], alone: AbstractContextManager[object]) -> None:
+        """Renews Q of candidates that are still there; beside other threads but for what is done `alone`."""
+        critic, version = self._critic, self.version
+        assert critic is not None and version is not None
+        with alone:
+            stored = self.database.observed(cell.unread(rows))
+        read = {row: decode(Candidate, blob) for row, blob in stored}
+        with alone:
+            cell.observe(read)
+            starts = cell.observed(rows)
+        if starts:
+            q = critic.value(list(starts.values()))
+            with alone:
+                cell.value(list(starts), q, np.array([version.epoch, version.counter]))
 
     def properties(self, query: ScoreQuery) -> list[dict[str, float]]:
         """What f_pi sees of tasks; MessageError that names the field which does not fit.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
-from common.messages import Candidate, Category, Proposal, Requested, decode, encode
+from common.messages import Category, Proposal, Requested, encode
 from curriculum.algorithms.base import Pick, Result
 from curriculum.task_space import Entry
 
@@ -134,10 +134,10 @@ class Database:
         query = "SELECT id, entry FROM candidates WHERE encoder = ? ORDER BY id"
         return self._sql.execute(query, (encoder,)).fetchall()
 
-    def observed(self, row: int) -> Candidate:
-        """The start observation of one."""
-        (found,) = self._sql.execute("SELECT observed FROM candidates WHERE id = ?", (row,)).fetchone()
-        return decode(Candidate, found)
+    def observed(self, rows: Iterable[int]) -> list[tuple[int, bytes]]:
+        """(row, encoded Candidate) of some."""
+        query = "SELECT id, observed FROM candidates WHERE id = ?"
+        return [self._sql.execute(query, (row,)).fetchone() for row in rows]
 
     def lease(self, proposal: Proposal, pick: Pick, seconds: float) -> None:
         """Notes that a task was handed out."""

@@ -44,10 +44,10 @@ CRITIC_REST_SECONDS = 6.0
 """Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
 TICK = 0.2
 """Seconds between two looks around."""
-Q_SECONDS, Q_BATCH, Q_REST = 0.03, 16, 0.0005
-"""Of a tick at most for Q of candidates, so few at a time that a question hardly waits for them."""
+Q_SECONDS, Q_BATCH = 0.03, 64
+"""Of a tick at most for Q of candidates, and how many are computed together."""
 REPORTS = 16
-"""Outcomes that are committed together at most, for the same reason."""
+"""Outcomes that are committed together at most: a question waits for them."""
 SWITCH_SECONDS = 0.0005
 """After which Python lets another thread in: its own 5 ms are a task's whole time."""
 
@@ -121,9 +121,7 @@ class CurriculumService:
         for cell, rows in stale:
             if time.monotonic() > until:
                 break
-            with self._lock:  # beside a question's many small operations it would cost more than before it
-                self.curriculum.refresh(cell, rows)
-            time.sleep(Q_REST)  # for whoever waits for the lock
+            self.curriculum.refresh(cell, rows, self._lock)
 
     def save(self) -> None:
         """Keeps the state; a full disk must not end the service."""

@@ -1,7 +1,6 @@
 """The candidates of a cell in arrays, against a plain list of them."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,21 +144,26 @@ def test_stale_are_those_whose_q_is_missing_or_of_other_weights():
     assert cell.stale(Version(epoch=2, counter=7)).tolist() == [1, 2, 3, 4]
 
 
-def test_start_observations_are_read_once_and_only_of_those_that_are_there():
+def test_start_observations_are_kept_of_those_that_are_there():
     task = Task(cell=0, seed=0, start=small_config().world.start)
-    read: list[int] = []
+    starts = {
+        row: Candidate(task=task, visual=np.array([float(row)]), lidar=np.zeros(1)) for row in range(1, 6)
+    }
+    cell = filled(4)
+    assert cell.unread([1, 2, 4, 5]) == [1, 2, 4]
+    cell.drop(2)
+    cell.observe(starts)
+    assert cell.unread([1, 2, 4, 5]) == []
+    assert cell.observed([4, 1, 2, 5]) == {4: starts[4], 1: starts[1]}
+    cell.drop(4)
+    assert cell.observed([4, 1]) == {1: starts[1]}
 
-    def reader(row: int) -> Candidate:
-        read.append(row)
-        return Candidate(task=task, visual=np.array([float(row)]), lidar=np.zeros(1))
 
+def test_q_of_a_candidate_that_has_left_is_nobodys():
     cell = filled(4)
     cell.drop(2)
-    look: Callable[[], list[float]] = lambda: [  # noqa: E731
-        float(c.visual[0]) for c in cell.observed([1, 2, 4], reader).values()
-    ]
-    assert look() == look() == [1.0, 4.0]
-    assert read == [1, 4]
+    value(cell, {1: 0.1, 2: 0.2, 3: 0.3, 9: 0.9})
+    assert [cell.entry(row).q for row in (1, 3, 4)] == [0.1, 0.3, None]
 
 
 def test_entry_of_a_candidate_keeps_its_text():

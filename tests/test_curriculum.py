@@ -3,6 +3,7 @@ import math
 import sqlite3
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +96,7 @@ def value(curriculum: Curriculum, learner: Learner, version: Version | None = No
     """Gives every candidate its Q under the weights of a learner."""
     curriculum.load_critic(version or Version(epoch=1), learner.tensors())
     for cell, rows in curriculum.stale(5):
-        curriculum.refresh(cell, rows)
+        curriculum.refresh(cell, rows, nullcontext())
 
 
 def outcome_of(proposal: Proposal, success: bool) -> Outcome:
@@ -332,14 +333,24 @@ def test_q_is_kept_until_weights_of_another_version_come():
     assert curriculum.propose(0, 0).q_version == "2.0"
 
 
-def test_candidate_that_leaves_while_its_q_is_due_takes_no_others_place():
-    curriculum, candidates = with_candidates(PLUS, 4)
-    learner = Learner(PLUS)
+@pytest.mark.parametrize("moment", [1, 2, 3])
+def test_candidate_that_leaves_while_its_q_is_computed_takes_no_others_place(file, moment):
+    config, learner = PLUS, Learner(PLUS)
+    candidates = {seed: make_candidate(config, seed) for seed in range(4)}
+    add(Curriculum(config, Database(file)), *candidates.values())
+    curriculum = Curriculum(config, Database(file))  # whose start observations are still to be read
     curriculum.load_critic(Version(epoch=1), learner.tensors())
     ((cell, rows),) = curriculum.stale(5)
-    proposal = curriculum.propose(0, 0)
-    curriculum.report([Report(outcome_of(proposal, True), origin(1))])
-    curriculum.refresh(cell, rows)
+    proposal, times = curriculum.propose(0, 0), []
+
+    class Lock(nullcontext):
+        def __enter__(self):
+            times.append(1)
+            if len(times) == moment:
+                curriculum.report([Report(outcome_of(proposal, True), origin(1))])
+
+    curriculum.refresh(cell, rows, Lock())
+    assert len(times) == 3
     left = [learner.q(c) for seed, c in candidates.items() if seed != task_of(proposal).seed]
     assert q_of(curriculum) == pytest.approx(left, abs=1e-5)
 

@@ -11,7 +11,7 @@ import pytest
 from common.config import Config
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
-from common.messages import Candidate, Candidates, MessageError, Origin, Outcome, Proposal
+from common.messages import Candidate, Candidates, MessageError, Origin, Outcome, Proposal, decode
 from common.observation import ObservationLayout
 from common.tasks import Task
 from curriculum.algorithms.base import Pick, Result
@@ -94,7 +94,9 @@ def test_what_is_committed_survives_and_what_is_not_does_not(file):
     first.close()
     second = Database(file)
     ((row, text),) = second.candidates("e1")
-    found, start = Entry.read(text), second.observed(row)
+    ((known, blob),) = second.observed([row])
+    found, start = Entry.read(text), decode(Candidate, blob)
+    assert known == row
     assert (row, found.task, found.properties) == (kept.row, kept.task, kept.properties)
     assert (start.visual == kept.observed.visual).all()
     assert (start.lidar == kept.observed.lidar).all()
