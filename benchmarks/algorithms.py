@@ -24,6 +24,10 @@ PAPER_INPUTS = "curriculum.inputs=['distance','agent_clearance','goal_clearance'
 ROWS: dict[str, tuple[str, tuple[str, ...]]] = {
     "NavACL-Q+": ("navacl-q", (NO_GATE,)),
     "NavACL-Q+, calibrated": ("navacl-q", (NO_GATE, "curriculum.calibrate=true")),
+    "NavACL-Q+, calibrated, averaged": (
+        "navacl-q",
+        (NO_GATE, "curriculum.calibrate=true", "curriculum.average=0.99"),
+    ),
     "NavACL-Q+, class-balanced": ("navacl-q", (NO_GATE, "curriculum.balanced=true")),
     "NavACL-Q+, both": ("navacl-q", (NO_GATE, "curriculum.balanced=true", "curriculum.calibrate=true")),
     "NavACL-Q+, the paper's inputs": ("navacl-q", (NO_GATE, PAPER_INPUTS)),
