@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 import sys
@@ -109,12 +110,15 @@ class CurriculumService:
         """Takes newer weights, and values candidates by them, a while at a time."""
         newest = self._weights.newest if self._weights else None
         if newest is not None and self.curriculum.version != newest[0]:
+            first = self.curriculum.version is None
             try:
                 self.curriculum.load_critic(*newest)
             except ValueError as error:
                 raise UsageError(
                     f"the learner has other networks than are configured here: {error}"
                 ) from None
+            if first:
+                gc.freeze()  # torch's objects, which stay: a collection of all held every answer up 0.1 s
         until = time.monotonic() + Q_SECONDS
         with self._lock:
             stale = self.curriculum.stale(Q_BATCH)
