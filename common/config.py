@@ -278,6 +278,9 @@ class CurriculumConfig(Section):
     fit_batch: Count = 64
     """Outcomes per gradient step, from the reservoir; unused by `navacl-q`, which takes the fresh ones."""
     reservoir: Count = 1500
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """f_pi predicts by a running mean of its weights that keeps this share of itself at each gradient step;
+    0: by its last weights."""
     random_limit: Fraction = 0.15
     """P(random) = min(random_limit, t / random_steps), t the asking actor's own steps (authors' code)."""
     random_steps: Positive = 20_000.0

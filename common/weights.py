@@ -1,4 +1,7 @@
-"""Versioned weights on the wire: safetensors with a checksum that is verified before use."""
+"""Versioned weights on the wire: safetensors with a checksum that is verified before use.
+
+torch, which takes seconds to load, is loaded with the first weights: who waits for them can answer meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,25 @@ import logging
 import queue
 import threading
 import time
+from typing import TYPE_CHECKING
 
 import zenoh
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
-from torch import Tensor
 
 from common.bus import Keys, Subscription, ask
 from common.errors import NoAnswerError, RefusedError
 from common.messages import MessageError, Nothing, Version, WeightsBlob
 from common.telemetry import Quantiles
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 log = logging.getLogger(__name__)
 
 
 def pack(version: Version, tensors: dict[str, Tensor]) -> WeightsBlob:
     """Tensors as a message."""
+    from safetensors.torch import save as save_tensors
+
     # safetensors refuses tensors that share memory, as those of a target network may
     blob = save_tensors({key: value.detach().clone().contiguous() for key, value in tensors.items()})
     return WeightsBlob(version=version, sha256=hashlib.sha256(blob).hexdigest(), blob=blob)
@@ -32,6 +38,8 @@ def unpack(message: WeightsBlob) -> dict[str, Tensor]:
     """The tensors; raises MessageError when the checksum or the format is wrong."""
     if hashlib.sha256(message.blob).hexdigest() != message.sha256:
         raise MessageError("weights are corrupted: the checksum does not match")
+    from safetensors.torch import load as load_tensors
+
     try:
         return dict(load_tensors(message.blob))
     except Exception as error:  # safetensors raises its own class without exporting a common base

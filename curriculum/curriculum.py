@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sqlite3
 import time
 import uuid
-from collections import Counter, OrderedDict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
-from itertools import chain, islice
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import safetensors.torch
+import safetensors.numpy
 
 from common.config import Config
+from common.delivery import DuplicateFilter
 from common.errors import UsageError
 from common.messages import (
+    Candidate,
     Candidates,
     MessageError,
     Origin,
@@ -26,17 +29,28 @@ from common.messages import (
     ScoreQuery,
     Scores,
     Snapshot,
+    Version,
+    decode,
 )
+from common.observation import ObservationLayout
 from curriculum.algorithms import make_algorithm
 from curriculum.algorithms.base import Pick, Result, State
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.calibration import brier_score, reliability
-from curriculum.critic import CriticView
+from curriculum.candidates import Cell, check_layout
 from curriculum.database import Database, Lease
-from curriculum.task_space import Entry, make_space
+from curriculum.task_space import AnyTask, Entry, Properties, Scaling, make_space
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from curriculum.critic import CriticView
 
 log = logging.getLogger(__name__)
-STATE = "curriculum"
+STATE, VALUES = "curriculum", "q"
+"""Names of what is saved: what was learned, and Q of candidates."""
+FORMAT = 2
+"""Of what algorithms save."""
 HISTORY = 200
 """Outcomes after which f_pi is kept for the pictures."""
 DAMAGE = sqlite3.DatabaseError, safetensors.SafetensorError, LookupError, ValueError, TypeError
@@ -60,32 +74,13 @@ class Gate:
             self.open = self.open or sum(self.outcomes) >= self.config.threshold * self.config.window
 
 
-class _Cell:
-    """The tasks of a cell, for an algorithm: candidates that nobody has in hand, oldest first."""
+class Report(NamedTuple):
+    """An outcome, and who brought it."""
 
-    def __init__(self, curriculum: Curriculum, cell: int) -> None:
-        self.cell, self._owner = cell, curriculum
-        self.entries: OrderedDict[int, Entry] = OrderedDict()
-
-    def draw(self, count: int) -> list[Entry]:
-        owner, now, entries = self._owner, time.time(), list(self.entries.values())
-        order = owner.rng.permutation(len(entries)).tolist()
-
-        def free(valued: bool) -> list[Entry]:
-            """As many as are asked for; f_pi does not compare those with Q and without."""
-            fit = (e for i in order if (e := entries[i]).lease <= now and (e.q is not None) == valued)
-            return list(islice(fit, count))
-
-        found = free(valued=True) or free(valued=False)
-        if found:
-            return found
-        share = owner.config.curriculum.narrowed_candidates
-        return [
-            owner.space.candidate(self.cell, share, owner.rng) for _ in range(min(count, owner.space.at_once))
-        ]
-
-    def new(self, level: float = 1.0) -> Entry:
-        return self._owner.space.draw(self.cell, level, self._owner.rng)
+    outcome: Outcome
+    origin: Origin
+    entry: Entry | None = None
+    """Of its task, where `knows` denies the proposal; made when it is needed if it is missing here."""
 
 
 class Curriculum:
@@ -99,7 +94,10 @@ class Curriculum:
         self.config, self.encoder = config, encoder
         self.database = database or Database(None)
         self.space = make_space(config)
-        self.critic = CriticView(config)
+        self._layout = ObservationLayout.of(config)
+        self._critic: CriticView | None = None
+        self.version: Version | None = None
+        """Of the weights that Q is computed by; None before the first."""
         self._load()
         with suppress(OSError), self._writing():
             self.database.drop_candidates_but(encoder)
@@ -112,7 +110,9 @@ class Curriculum:
         self.proposed: Counter[str] = Counter()
         self.outcomes = self.history = 0
         self.judged: deque[tuple[float, bool]] = deque(maxlen=JUDGED)
-        self.cells = [_Cell(self, index) for index in range(self.space.cells)]
+        self._scaling = Scaling(self.space.inputs, self.space.scales)
+        share = self.config.curriculum.narrowed_candidates
+        self.cells = [Cell(i, self.space, self._scaling, share, self.rng) for i in range(self.space.cells)]
         try:
             self._load_tasks()
             for outcome in self.database.outcomes(after=self._load_state()):
@@ -121,32 +121,43 @@ class Curriculum:
             raise UsageError(f"{self.database.name} does not fit: {error}; move it to start afresh") from None
 
     def _load_tasks(self) -> None:
-        self.seen, leases = self.database.origins(), self.database.leases()
-        for entry in self.database.candidates(self.encoder):
-            assert entry.row is not None
-            entry.lease = leases.get(entry.row, 0.0)
-            self.cells[entry.cell].entries[entry.row] = entry
+        """Candidates in their arrays, from which a task is made only when it is chosen."""
+        found: list[list[tuple[int, str, Properties]]] = [[] for _ in self.cells]
+        for row, text in self.database.candidates(self.encoder):
+            cell, _, properties, _ = json.loads(text)
+            found[cell].append((row, text, properties))
+        for cell, candidates in zip(self.cells, found, strict=True):
+            if candidates:
+                rows, texts, properties = zip(*candidates, strict=True)
+                cell.add(rows, texts, self._scaling(properties), len(rows))
+        leases, valued = self.database.leases(), self.database.load_state(VALUES)
+        known = safetensors.numpy.load(valued[1]) if valued else {}
+        for cell in self.cells:
+            for row in leases.keys() & set(cell.table.row.tolist()):
+                cell.lend(row, leases[row])
+            if known:
+                cell.value(known["row"].tolist(), known["q"], known["version"])
+        self.seen = self.database.origins()
 
     @property
     def _kind(self) -> list[object]:
         """What a saved state must agree with."""
         settings = self.config.curriculum
         scales = [list(scale) for scale in self.space.scales.values()]
-        return [settings.algorithm, list(self.space.inputs), list(settings.hidden), scales]
+        return [settings.algorithm, list(self.space.inputs), list(settings.hidden), scales, FORMAT]
 
     def _load_state(self) -> int:
         """Takes a saved state; returns the number of the last outcome in it."""
         found = self.database.load_state(STATE)
         if found is None:
             return 0
-        values, tensors = found
+        values, arrays = found
         if values["kind"] != self._kind:
-            log.warning(
-                "another algorithm than before: it learns from the outcomes in %s", self.database.name
-            )
+            why = "another algorithm or format than before"
+            log.warning("%s: it learns from the outcomes in %s", why, self.database.name)
             return 0
         self.rng.bit_generator.state = values["rng"]
-        self.algorithm.restore(State(safetensors.torch.load(tensors), values["algorithm"]))
+        self.algorithm.restore(State(safetensors.numpy.load(arrays), values["algorithm"]))
         self.gate.open = self.gate.open or bool(values["gate_open"])
         self.gate.outcomes.extend(values["gate_outcomes"])
         self.proposed = Counter(values["proposed"])
@@ -169,13 +180,16 @@ class Curriculum:
             "outcomes": self.outcomes,
             "last": self.database.last_outcome(),
         }
-        tensors = safetensors.torch.save(state.tensors)
+        arrays = safetensors.numpy.save(state.arrays)
+        tables = [cell.table._asdict() for cell in self.cells]
+        known = {name: np.concatenate([t[name] for t in tables]) for name in ("row", "q", "version")}
         with self._writing():
-            self.database.save_state(STATE, values, tensors)
+            self.database.save_state(STATE, values, arrays)
+            self.database.save_state(VALUES, {}, safetensors.numpy.save(known))
             self.database.drop_leases(before=time.time() - self.config.curriculum.lease)
             if self.outcomes >= self.history + HISTORY:
                 about = {"kind": self._kind, "algorithm": dict(state.values)}
-                self.database.save_network(self.outcomes, about, tensors)
+                self.database.save_network(self.outcomes, about, arrays)
                 self.history = self.outcomes - self.outcomes % HISTORY
 
     @contextmanager
@@ -190,7 +204,7 @@ class Curriculum:
 
     def __len__(self) -> int:
         """Candidates in the database."""
-        return sum(len(cell.entries) for cell in self.cells)
+        return sum(map(len, self.cells))
 
     def propose(self, cell: int, t: int) -> Proposal:
         """A task for a cell, asked at the agent's own step t (algorithm 2); MessageError for no such cell."""
@@ -206,6 +220,8 @@ class Curriculum:
         proposal = self._proposal(pick)
         with suppress(OSError), self._writing():  # an outcome without a lease counts by its task
             self.database.lease(proposal, pick, self.config.curriculum.lease)
+        if pick.entry.row is not None:
+            self.cells[cell].lend(pick.entry.row, pick.entry.lease)
         return proposal
 
     def _proposal(self, pick: Pick) -> Proposal:
@@ -216,7 +232,7 @@ class Curriculum:
             reason = "not an input of f_pi"
         elif entry.q is not None:
             reason = "critic"
-        elif entry.observed is None:
+        elif entry.row is None:
             reason = "no candidate in the database; by geometry alone"
         else:
             reason = "no critic yet"
@@ -238,27 +254,41 @@ class Curriculum:
             dolly=entry.poses and entry.poses[1],
         )
 
-    def report(self, outcome: Outcome, origin: Origin) -> None:
-        """Takes how a task ended, once for each proposal; MessageError for an impossible task."""
-        with self._writing():
-            lease = self.database.end_lease(outcome.proposal) if outcome.proposal else None
-            if lease is None:
-                lease = Lease(None, None, "unserved", self._entry(outcome.task), None)
-            result = Result(lease.entry, lease.category, lease.f, outcome.success)
-            if lease.candidate is not None:
-                self.database.drop_candidate(lease.candidate)
-            is_new = self.database.add_outcome(outcome.proposal, origin.actor, result, lease.requested)
-            self.database.keep_origin(self.seen, origin)
-        self.seen.add(origin)
-        self.cells[lease.entry.cell].entries.pop(lease.candidate or 0, None)
-        if is_new:
-            self._learn(result)
+    def knows(self, outcome: Outcome) -> bool:
+        """Whether it is of a task that was proposed here, and has not been reported."""
+        return outcome.proposal is not None and self.database.has_lease(outcome.proposal)
 
-    def _entry(self, task: object) -> Entry:
+    def entry(self, task: AnyTask) -> Entry:
+        """A task with its geometry, a millisecond; MessageError for an impossible one. Touches nothing."""
         try:
-            return self.space.entry(task)  # type: ignore[arg-type]
+            return self.space.entry(task)
         except UsageError as error:
             raise MessageError(f"task: {error}") from None
+
+    def report(self, reports: Iterable[Report]) -> None:
+        """Takes how tasks ended, all or none, once for each proposal; MessageError for an impossible task."""
+        ended: list[tuple[int | None, Result, bool]] = []
+        heard, senders = DuplicateFilter(), set[tuple[str, str]]()
+        with self._writing():
+            for outcome, origin, entry in reports:
+                lease = self.database.end_lease(outcome.proposal) if outcome.proposal else None
+                if lease is None:
+                    lease = Lease(None, None, "unserved", entry or self.entry(outcome.task), None)
+                result = Result(lease.entry, lease.category, lease.f, outcome.success)
+                if lease.candidate is not None:
+                    self.database.drop_candidate(lease.candidate)
+                is_new = self.database.add_outcome(outcome.proposal, origin.actor, result, lease.requested)
+                ended.append((lease.candidate, result, is_new))
+                sender = origin.actor, origin.boot
+                heard.restore([(heard if sender in senders else self.seen).after(origin)])
+                senders.add(sender)
+            self.database.keep_origins(heard)
+        self.seen.restore(heard.state())
+        for candidate, result, is_new in ended:
+            if candidate is not None:
+                self.cells[result.entry.cell].drop(candidate)
+            if is_new:
+                self._learn(result)
 
     def _learn(self, result: Result) -> None:
         self.outcomes += 1
@@ -275,31 +305,63 @@ class Curriculum:
         """
         entries = []
         for candidate in message.candidates:
-            self.critic.check(candidate)
-            entry = self._entry(candidate.task)
+            check_layout(candidate, self._layout)
+            entry = self.entry(candidate.task)
             entry.observed = candidate
             entries.append(entry)
         return entries
 
     def add(self, entries: Iterable[Entry], origin: Origin) -> None:
         """Takes candidates into the database, where the oldest of their cell make room."""
-        most, after = self.config.curriculum.store_per_cell, [cell.entries.copy() for cell in self.cells]
+        most, new = self.config.curriculum.store_per_cell, defaultdict[int, list[Entry]](list)
+        heard = DuplicateFilter()
+        heard.restore([self.seen.after(origin)])
         with self._writing():
             for entry in entries:
                 self.database.add_candidate(entry, self.encoder)
-                assert entry.row is not None
-                held = after[entry.cell]
-                held[entry.row] = entry
-                if len(held) > most:
-                    self.database.drop_candidate(held.popitem(last=False)[0])
-            self.database.keep_origin(self.seen, origin)
-        self.seen.add(origin)
-        for cell, held in zip(self.cells, after, strict=True):
-            cell.entries = held
+                new[entry.cell].append(entry)
+            for cell, added in new.items():
+                held = [*self.cells[cell].table.row.tolist(), *(entry.row for entry in added)]
+                for row in held[:-most]:
+                    self.database.drop_candidate(row)
+            self.database.keep_origins(heard)
+        self.seen.restore(heard.state())
+        for cell, added in new.items():
+            rows, texts, properties, observed = zip(
+                *((e.row, e.text, e.properties, e.observed) for e in added), strict=True
+            )
+            self.cells[cell].add(rows, texts, self._scaling(properties), most, observed)
 
-    def stale(self) -> list[Entry]:
-        """Candidates whose Q could be newer, for `critic.refresh`, which may run beside other threads."""
-        return self.critic.stale(chain.from_iterable(cell.entries.values() for cell in self.cells))
+    def load_critic(self, version: Version, tensors: dict[str, Tensor]) -> None:
+        """Takes newer weights; ValueError when they do not fit."""
+        if self._critic is None:
+            from curriculum.critic import CriticView  # brings torch, for which no answer is to wait
+
+            self._critic = CriticView(self.config)
+        self._critic.load(tensors)
+        self.version = version
+
+    def stale(self, size: int) -> list[tuple[Cell, list[int]]]:
+        """Candidates whose Q could be newer, rows of a cell, so many together at most."""
+        if self.version is None:
+            return []
+        found = [(cell, cell.stale(self.version).tolist()) for cell in self.cells]
+        return [(cell, rows[i : i + size]) for cell, rows in found for i in range(0, len(rows), size)]
+
+    def refresh(self, cell: Cell, rows: list[int], alone: AbstractContextManager[object]) -> None:
+        """Renews Q of candidates that are still there; beside other threads but for what is done `alone`."""
+        critic, version = self._critic, self.version
+        assert critic is not None and version is not None
+        with alone:
+            stored = self.database.observed(cell.unread(rows))
+        read = {row: decode(Candidate, blob) for row, blob in stored}
+        with alone:
+            cell.observe(read)
+            starts = cell.observed(rows)
+        if starts:
+            q = critic.value(list(starts.values()))
+            with alone:
+                cell.value(list(starts), q, np.array([version.epoch, version.counter]))
 
     def properties(self, query: ScoreQuery) -> list[dict[str, float]]:
         """What f_pi sees of tasks; MessageError that names the field which does not fit.
@@ -319,8 +381,9 @@ class Curriculum:
         if (item.task is None) == (item.properties is None):
             raise MessageError(f"tasks.{index}: either task or properties")
         if item.properties is None:
+            assert item.task is not None
             try:
-                return dict(self._entry(item.task).properties)
+                return dict(self.entry(item.task).properties)
             except MessageError as error:
                 raise MessageError(f"tasks.{index}.{error}") from None
         needed = [name for name in self.space.inputs if name != "q"]
@@ -342,7 +405,7 @@ class Curriculum:
         return Snapshot(
             algorithm=self.config.curriculum.algorithm,
             outcomes=self.outcomes,
-            candidates=[len(cell.entries) for cell in self.cells],
+            candidates=[len(cell) for cell in self.cells],
             leases=self.database.count_leases(),
             gate_open=self.gate.open,
             proposed=dict(self.proposed),

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
-from common.messages import Candidate, Category, Origin, Proposal, Requested, decode, encode
+from common.messages import Category, Proposal, Requested, encode
 from curriculum.algorithms.base import Pick, Result
 from curriculum.task_space import Entry
 
@@ -121,7 +121,7 @@ class Database:
         assert entry.observed is not None
         found = self._do(
             "INSERT INTO candidates (encoder, entry, observed) VALUES (?, ?, ?)",
-            (encoder, json.dumps(entry.dump()), encode(entry.observed)),
+            (encoder, entry.text, encode(entry.observed)),
         )
         entry.row = found.lastrowid
 
@@ -129,13 +129,15 @@ class Database:
         """Takes one out."""
         self._do("DELETE FROM candidates WHERE id = ?", (row,))
 
-    def candidates(self, encoder: str) -> Iterator[Entry]:
-        """Those of one encoder, oldest first."""
-        query = "SELECT id, entry, observed FROM candidates WHERE encoder = ? ORDER BY id"
-        for row, dumped, observed in self._sql.execute(query, (encoder,)):
-            entry = Entry.load(json.loads(dumped))
-            entry.row, entry.observed = row, decode(Candidate, observed)
-            yield entry
+    def candidates(self, encoder: str) -> list[tuple[int, str]]:
+        """(row, text of the Entry) of those of one encoder, oldest first."""
+        query = "SELECT id, entry FROM candidates WHERE encoder = ? ORDER BY id"
+        return self._sql.execute(query, (encoder,)).fetchall()
+
+    def observed(self, rows: Iterable[int]) -> list[tuple[int, bytes]]:
+        """(row, encoded Candidate) of some."""
+        query = "SELECT id, observed FROM candidates WHERE id = ?"
+        return [self._sql.execute(query, (row,)).fetchone() for row in rows]
 
     def lease(self, proposal: Proposal, pick: Pick, seconds: float) -> None:
         """Notes that a task was handed out."""
@@ -150,7 +152,7 @@ class Database:
                 entry.row,
                 pick.requested,
                 pick.category,
-                json.dumps(entry.dump()),
+                entry.text,
                 entry.q,
                 pick.f,
             ),
@@ -174,13 +176,18 @@ class Database:
         query = "SELECT count(*) FROM leases WHERE until >= ?"
         return int(self._sql.execute(query, (time.time(),)).fetchone()[0])
 
+    def has_lease(self, proposal: str) -> bool:
+        """Whether something was handed out under this name."""
+        query = "SELECT 1 FROM leases WHERE proposal = ?"
+        return self._sql.execute(query, (proposal,)).fetchone() is not None
+
     def end_lease(self, proposal: str) -> Lease | None:
         """What was handed out under this name, from now on no longer."""
         found = self._do("DELETE FROM leases WHERE proposal = ? RETURNING *", (proposal,)).fetchone()
         if found is None:
             return None
-        _, _, _, candidate, requested, category, dumped, q, f = found
-        entry = Entry.load(json.loads(dumped))
+        _, _, _, candidate, requested, category, text, q, f = found
+        entry = Entry.read(text)
         entry.q = q
         return Lease(candidate, requested, category, entry, f)
 
@@ -198,7 +205,7 @@ class Database:
                 actor,
                 requested,
                 result.category,
-                json.dumps(entry.dump()),
+                entry.text,
                 entry.q,
                 result.f,
                 int(result.success),
@@ -208,10 +215,10 @@ class Database:
 
     def outcomes(self, after: int = 0) -> Iterator[Outcome]:
         """Those on record, oldest first."""
-        for number, at, category, dumped, q, f, success in self._sql.execute(
+        for number, at, category, text, q, f, success in self._sql.execute(
             "SELECT id, at, category, entry, q, f, success FROM outcomes WHERE id > ? ORDER BY id", (after,)
         ):
-            entry = Entry.load(json.loads(dumped))
+            entry = Entry.read(text)
             entry.q = q
             yield Outcome(number, at, Result(entry, category, f, bool(success)))
 
@@ -219,11 +226,11 @@ class Database:
         """Number of the newest; 0 before the first."""
         return int(self._sql.execute("SELECT coalesce(max(id), 0) FROM outcomes").fetchone()[0])
 
-    def keep_origin(self, seen: DuplicateFilter, origin: Origin) -> None:
-        """Keeps what a filter will know of the sender of a message."""
-        *key, following, gaps = seen.after(origin)
-        values = (*key, following, json.dumps(gaps))
-        self._do("INSERT OR REPLACE INTO origins VALUES (?, ?, ?, ?)", values)
+    def keep_origins(self, seen: DuplicateFilter) -> None:
+        """Keeps what a filter knows, in place of what was known of the same senders."""
+        for actor, boot, following, gaps in seen.state():
+            values = (actor, boot, following, json.dumps(gaps))
+            self._do("INSERT OR REPLACE INTO origins VALUES (?, ?, ?, ?)", values)
 
     def origins(self) -> DuplicateFilter:
         """A filter that knows what has arrived."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import safetensors.torch
+import safetensors.numpy
 from numpy.typing import NDArray
 
 from common.config import Config, CurriculumConfig, parse
@@ -267,7 +267,7 @@ def proposed(history: History, name: str, stage: slice) -> Floats:
 
 def predict(history: History, network: Network) -> NavaclQ:
     """f_pi as it was then; raises LeftOutError when there is none or config.toml is another's."""
-    algorithm, inputs, hidden, scales = network.values["kind"]
+    algorithm, inputs, hidden, scales, *_ = network.values["kind"]
     if not algorithm.startswith("navacl"):
         raise LeftOutError(f"{algorithm} has no f_pi")
     values = network.values["algorithm"]
@@ -286,7 +286,7 @@ def predict(history: History, network: Network) -> NavaclQ:
         raise LeftOutError("config.toml, with the ranges of its parameters, is missing or another's")
     found = NavaclQ(settings, space, 0)
     try:
-        found.restore(State(safetensors.torch.load(network.tensors), values))
+        found.restore(State(safetensors.numpy.load(network.tensors), values))
     except (KeyError, ValueError, safetensors.SafetensorError) as error:
         raise LeftOutError(f"f_pi after {network.outcomes} outcomes cannot be read: {error}") from None
     return found

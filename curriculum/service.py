@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from common.messages import (
 from common.telemetry import Reporter, stop_on_signals
 from common.weights import WeightsPuller
 from curriculum.algorithms.navacl_q import NavaclQ
-from curriculum.curriculum import Curriculum
+from curriculum.curriculum import Curriculum, Report
 from curriculum.database import Database
 
 log = logging.getLogger(__name__)
@@ -44,8 +45,10 @@ CRITIC_REST_SECONDS = 6.0
 """Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
 TICK = 0.2
 """Seconds between two looks around."""
-Q_SECONDS, Q_BATCH, Q_REST = 0.03, 16, 0.0005
-"""Of a tick at most for Q of candidates, so few at a time that a question hardly waits for them."""
+Q_SECONDS, Q_BATCH = 0.03, 64
+"""Of a tick at most for Q of candidates, and how many are computed together."""
+REPORTS = 16
+"""Outcomes that are committed together at most: a question waits for them."""
 SWITCH_SECONDS = 0.0005
 """After which Python lets another thread in: its own 5 ms are a task's whole time."""
 
@@ -71,6 +74,8 @@ class CurriculumService:
         self.curriculum = Curriculum(config, database, (digest or {}).get("encoder", ""))
         self._digest = digest
         self._failed_writes, self._failed_at, self._closed = 0, 0.0, False
+        self._arrived: dict[Origin, Report] = {}
+        """Outcomes that are neither committed nor acknowledged yet."""
         self._lock = threading.Lock()
         keys = Keys(run)
         member = Member("curriculum", group, "curriculum")
@@ -82,8 +87,10 @@ class CurriculumService:
             serve(session, keys.task, TaskQuery, self._propose),
             serve(session, keys.score, ScoreQuery, self._score),
             serve(session, keys.snapshot, Nothing, self._snapshot),
-            self._receiver(session, keys.result, self._take_outcome, Outcome.max_bytes),
-            self._receiver(session, keys.candidates, self._take_candidates, Candidates.max_bytes),
+            Receiver(
+                session, keys.result, self._take_outcome, self._seen, Outcome.max_bytes, self._commit_outcomes
+            ),
+            Receiver(session, keys.candidates, self._take_candidates, self._seen, Candidates.max_bytes),
         ]
         self._reporter = Reporter(session, keys, member)
 
@@ -101,22 +108,24 @@ class CurriculumService:
 
     def _refresh_q(self) -> None:
         """Takes newer weights, and values candidates by them, a while at a time."""
-        critic, newest = self.curriculum.critic, self._weights.newest if self._weights else None
-        if newest is not None and critic.version != newest[0]:
+        newest = self._weights.newest if self._weights else None
+        if newest is not None and self.curriculum.version != newest[0]:
+            first = self.curriculum.version is None
             try:
-                critic.load(*newest)
+                self.curriculum.load_critic(*newest)
             except ValueError as error:
                 raise UsageError(
                     f"the learner has other networks than are configured here: {error}"
                 ) from None
+            if first:
+                gc.freeze()  # torch's objects, which stay: a collection of all held every answer up 0.1 s
         until = time.monotonic() + Q_SECONDS
         with self._lock:
-            stale = self.curriculum.stale()
-        while stale and time.monotonic() < until:
-            with self._lock:  # beside a question's many small operations it would cost more than before it
-                critic.refresh(stale[:Q_BATCH])
-            del stale[:Q_BATCH]
-            time.sleep(Q_REST)  # for whoever waits for the lock
+            stale = self.curriculum.stale(Q_BATCH)
+        for cell, rows in stale:
+            if time.monotonic() > until:
+                break
+            self.curriculum.refresh(cell, rows, self._lock)
 
     def save(self) -> None:
         """Keeps the state; a full disk must not end the service."""
@@ -157,19 +166,23 @@ class CurriculumService:
         with self._lock:
             return self.curriculum.snapshot()
 
-    def _receiver(
-        self, session: zenoh.Session, channel: str, take: Callable[[Parcel], None], max_bytes: int
-    ) -> Receiver:
-        def seen(origin: Origin) -> bool:
-            return self.curriculum.seen.seen(origin)
-
-        return Receiver(session, channel, take, seen, max_bytes)
+    def _seen(self, origin: Origin) -> bool:
+        return origin in self._arrived or self.curriculum.seen.seen(origin)
 
     def _take_outcome(self, parcel: Parcel) -> None:
         message = decode(Outcome, parcel.payload)
         self._check(message.digest)
-        with self._writing():
-            self.curriculum.report(message, parcel.origin)
+        with self._lock:
+            known = self.curriculum.knows(message)
+        entry = None if known else self.curriculum.entry(message.task)
+        self._arrived[parcel.origin] = Report(message, parcel.origin, entry)
+
+    def _commit_outcomes(self) -> None:
+        """Those that came together; after an error none of the rest is acknowledged, and all come again."""
+        reports, self._arrived = list(self._arrived.values()), {}
+        for start in range(0, len(reports), REPORTS):
+            with self._writing():
+                self.curriculum.report(reports[start : start + REPORTS])
 
     def _take_candidates(self, parcel: Parcel) -> None:
         message = decode(Candidates, parcel.payload)
@@ -183,7 +196,7 @@ class CurriculumService:
             check_digest(self._digest, digest)
 
     def _report(self) -> None:
-        state, version = self.curriculum, self.curriculum.critic.version or Version()
+        state, version = self.curriculum, self.curriculum.version or Version()
         values: dict[str, float | int | str] = {
             "candidates": len(state),
             "outcomes": state.outcomes,

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections import deque
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import safetensors.torch
-import torch
-import torch.nn.functional as F
+import safetensors.numpy
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from common.config import CurriculumConfig
 from curriculum.calibration import Calibration
-from curriculum.task_space import Properties, Scales
+from curriculum.perceptron import Adam, Floats, Perceptron, cross_entropy, sigmoid
+from curriculum.task_space import Properties, Scales, Scaling
 
-HUGE = 1e6
-"""Properties beyond it, from whoever asks for a score, count as it."""
+Arrays = dict[str, NDArray[Any]]
 
 
 class SuccessNetwork:
@@ -34,29 +29,29 @@ class SuccessNetwork:
     def __init__(self, config: CurriculumConfig, inputs: Sequence[str], scales: Scales, seed: int) -> None:
         self.config = config
         self.inputs, self._scales = tuple(sorted(inputs, key=lambda name: name == "q")), scales  # q is last
-        self._names = [name for name in self.inputs if name != "q"]
-        self._centres, self._halves = np.array([scales[n] for n in self._names]).reshape(-1, 2).T
+        self.scaling = Scaling(self.inputs, scales)
         self._reservoir_fits = config.algorithm == "navacl-q+"
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            sizes = (len(self.inputs), *config.hidden)
-            layers: list[nn.Module] = []
-            for a, b in pairwise(sizes):
-                layers += [nn.Linear(a, b), nn.ReLU()]
-            self.net = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
-        self._optimizer = torch.optim.Adam(self.net.parameters(), config.learning_rate, fused=True)
+        sizes = (len(self.inputs), *config.hidden)
+        self.net = Perceptron(sizes, np.random.default_rng([seed, 1]))
+        self.mean = Perceptron(sizes, np.random.default_rng([seed, 1])) if config.average else self.net
+        """What predicts: of the running mean of the weights, if there is to be one."""
+        self._adam = Adam(self.net.values, config.learning_rate)
         self._rng = np.random.default_rng([seed, 2])
-        self._fresh: list[NDArray[np.float64]] = []
-        self._reservoir: deque[NDArray[np.float64]] = deque(maxlen=config.reservoir)
+        self._fresh: list[Floats] = []
+        self._reservoir: Floats = np.empty((config.reservoir, len(self.inputs) + 1))
+        """Outcomes as rows of inputs, Q as it is, and success; `_taken` of them so far, round and round."""
+        self._taken = 0
         self._q_low, self._q_high, self._q_mean = math.inf, -math.inf, 0.0
         self.fits = 0
         self.loss = math.nan
 
-    def predict(self, properties: Sequence[Properties], q: Sequence[float | None]) -> NDArray[np.float64]:
+    def predict(self, properties: Sequence[Properties], q: Sequence[float | None]) -> Floats:
         """f_pi of N tasks, (N,) in [0, 1]; KeyError for one without a property that is an input."""
-        rows = self._rows(properties, q)
-        with torch.no_grad():
-            return torch.sigmoid(self.net(self._scale(rows))).squeeze(-1).double().numpy()
+        return self.predict_scaled(self.scaling(properties), np.array(q, float))
+
+    def predict_scaled(self, scaled: Floats, q: Floats) -> Floats:
+        """The same from scaled properties (N, P), and Q (N,), NaN where it is not known."""
+        return sigmoid(self.mean.logits(self._inputs(self._rows(scaled, q))))
 
     def add(self, properties: Properties, q: float | None, success: bool) -> bool:
         """Takes an outcome; after every m of them fits, and says so."""
@@ -64,9 +59,10 @@ class SuccessNetwork:
             share = 0.02 if self._q_low <= self._q_high else 1.0  # the first Q is the mean
             self._q_mean += share * (q - self._q_mean)
             self._q_low, self._q_high = min(self._q_low, q), max(self._q_high, q)
-        row = np.append(self._rows([properties], [q])[0], float(success))
+        row = np.append(self._rows(self.scaling([properties]), np.array([q], float))[0], float(success))
         self._fresh.append(row)
-        self._reservoir.append(row)
+        self._reservoir[self._taken % len(self._reservoir)] = row
+        self._taken += 1
         if len(self._fresh) < self.config.batch_size:
             return False
         self._fit()
@@ -75,21 +71,20 @@ class SuccessNetwork:
 
     def _fit(self) -> None:
         """`navacl-q`: one step on the m fresh outcomes. `navacl-q+`: several, on draws from the reservoir."""
-        rows = np.array(self._reservoir if self._reservoir_fits else self._fresh)
+        rows = self._reservoir[: self._taken] if self._reservoir_fits else np.array(self._fresh)
         if "q" in self.inputs:
             real = ~np.isnan(rows[:, -2])
             enough = real.sum() >= (self.config.batch_size if self._reservoir_fits else 1)
             rows = rows[real] if enough or real.all() else rows[~real]
-        inputs, labels = self._scale(rows[:, :-1]), torch.from_numpy(rows[:, -1]).float()
+        inputs, labels = self._inputs(rows[:, :-1]), rows[:, -1]
         for _ in range(self.config.fit_steps):
-            draw = self._draw(rows[:, -1] > 0) if self._reservoir_fits else np.arange(len(rows))
-            chosen = torch.from_numpy(draw)
-            logits = self.net(inputs[chosen]).squeeze(-1)
-            loss = F.binary_cross_entropy_with_logits(logits, labels[chosen])
-            self._optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            self._optimizer.step()
-            self.loss = loss.item()
+            chosen = self._draw(labels > 0) if self._reservoir_fits else np.arange(len(rows))
+            gradient, logits = self.net.gradient(inputs[chosen], labels[chosen])
+            self._adam.step(gradient)
+            if self.config.average:
+                keep = min(self.config.average, self._adam.steps / (self._adam.steps + 9))
+                self.mean.values += (1 - keep) * (self.net.values - self.mean.values)
+        self.loss = cross_entropy(logits, labels[chosen])
         self.fits += 1
 
     def _draw(self, success: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -100,68 +95,64 @@ class SuccessNetwork:
         halves = (np.flatnonzero(success), size // 2), (np.flatnonzero(~success), size - size // 2)
         return np.concatenate([half[self._rng.integers(len(half), size=n)] for half, n in halves])
 
-    def _rows(self, properties: Sequence[Properties], q: Sequence[float | None]) -> NDArray[np.float64]:
-        """The inputs of N tasks, properties scaled, Q last as it is."""
-        values = np.array([p[name] for p in properties for name in self._names], float)
-        values = np.clip(values, -HUGE, HUGE).reshape(len(properties), len(self._names))
-        rows = (values - self._centres) / self._halves
-        if "q" in self.inputs:
-            rows = np.column_stack([rows, [math.nan if value is None else value for value in q]])
-        return np.asarray(rows)
+    def _rows(self, scaled: Floats, q: Floats) -> Floats:
+        """The inputs of N tasks, Q last as it is."""
+        return np.column_stack([scaled, q]) if "q" in self.inputs else scaled
 
-    def _scale(self, rows: NDArray[np.float64]) -> Tensor:
+    def _inputs(self, rows: Floats) -> Floats:
         """Rows with Q brought to [-1, 1] by its running range, and missing ones to its mean."""
         if "q" not in self.inputs:
-            return torch.from_numpy(rows).float()
+            return rows
         scaled = rows.copy()
         half = max((self._q_high - self._q_low) / 2, 1e-6)
         middle = (self._q_high + self._q_low) / 2 if half > 1e-6 else self._q_mean
         q = np.where(np.isnan(rows[:, -1]), self._q_mean, rows[:, -1])
         scaled[:, -1] = np.clip((q - middle) / half, -1.5, 1.5) if half > 1e-6 else 0.0
-        return torch.from_numpy(scaled).float()
+        return scaled
 
     def file(self, calibration: Calibration) -> bytes:
         """f_pi as safetensors; inputs, scales, the range of Q and the correction in the metadata."""
-        tensors = {key: value.contiguous() for key, value in self.net.state_dict().items()}
-        scales = {name: self._scales[name] for name in self._names}
         about = {
             "inputs": self.inputs,
-            "scales": scales,
+            "scales": {name: self._scales[name] for name in self.scaling.names},
             "q_mean": self._q_mean,
             "calibration": (calibration.a, calibration.b),
         }
         if self._q_low <= self._q_high:
             about["q_range"] = (self._q_low, self._q_high)
-        return safetensors.torch.save(tensors, {"f_pi": json.dumps(about)})
+        tensors = self._named("", self.mean.values.astype(np.float32))
+        return bytes(safetensors.numpy.save(tensors, {"f_pi": json.dumps(about)}))
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and values to save."""
-        tensors = {f"net.{key}": value for key, value in self.net.state_dict().items()}
-        for index, slots in self._optimizer.state_dict()["state"].items():
-            tensors |= {f"adam.{index}.{key}": value for key, value in slots.items()}
-        width = len(self.inputs) + 1
-        tensors["reservoir"] = torch.from_numpy(np.array(self._reservoir).reshape(-1, width))
-        tensors["fresh"] = torch.from_numpy(np.array(self._fresh).reshape(-1, width))
-        numbers: dict[str, Any] = {"q_mean": self._q_mean, "fits": self.fits}
-        numbers["rng"] = self._rng.bit_generator.state
+    def _named(self, kind: str, vector: Floats) -> Arrays:
+        """A vector like that of the parameters, by the names of the layers in torch."""
+        found: Arrays = {}
+        for i, (weight, bias) in enumerate(self.net.views(vector)):
+            found |= {f"{kind}{2 * i}.weight": weight, f"{kind}{2 * i}.bias": bias}
+        return found
+
+    def _arrays(self) -> Arrays:
+        """All of the state but fresh outcomes: the arrays themselves."""
+        networks = self._named("net.", self.net.values) | self._named("mean.", self.mean.values)
+        adam = self._named("adam.mean.", self._adam.mean) | self._named("adam.square.", self._adam.square)
+        return networks | adam | {"reservoir": self._reservoir[: self._taken]}
+
+    def state(self) -> tuple[Arrays, dict[str, Any]]:
+        """Arrays and values to save."""
+        fresh = np.array(self._fresh).reshape(-1, self._reservoir.shape[1])
+        numbers: dict[str, Any] = {"q_mean": self._q_mean, "fits": self.fits, "taken": self._taken}
+        numbers |= {"steps": self._adam.steps, "rng": self._rng.bit_generator.state}
         if self._q_low <= self._q_high:
             numbers |= {"q_low": self._q_low, "q_high": self._q_high}
-        return tensors, numbers
+        return self._arrays() | {"fresh": fresh}, numbers
 
-    def restore(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-        """Takes what `state` gave; raises ValueError when it does not fit."""
-        try:
-            self.net.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("net.")})
-        except RuntimeError as error:
-            raise ValueError(str(error).splitlines()[-1].strip()) from None
-        adam = self._optimizer.state_dict()
-        for name, value in tensors.items():
-            if name.startswith("adam."):
-                _, index, key = name.split(".")
-                adam["state"].setdefault(int(index), {})[key] = value.clone()
-        self._optimizer.load_state_dict(adam)
-        self._reservoir.extend(tensors["reservoir"].numpy())
-        self._fresh = list(tensors["fresh"].numpy())
-        self._q_mean, self.fits = numbers["q_mean"], int(numbers["fits"])
+    def restore(self, arrays: Arrays, numbers: dict[str, Any]) -> None:
+        """Takes what `state` gave; raises ValueError or KeyError when it does not fit."""
+        self._taken, self._adam.steps, self.fits = (int(numbers[name]) for name in ("taken", "steps", "fits"))
+        for name, own in self._arrays().items():
+            if arrays[name].shape != own.shape:
+                raise ValueError(f"{name} is of shape {arrays[name].shape}, expected {own.shape}")
+            own[:] = arrays[name]
+        self._fresh = list(arrays["fresh"])
+        self._q_mean = numbers["q_mean"]
         self._rng.bit_generator.state = numbers["rng"]
         self._q_low, self._q_high = numbers.get("q_low", math.inf), numbers.get("q_high", -math.inf)

@@ -8,13 +8,15 @@ those it always or never solves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from common.config import Config
 from curriculum.algorithms import make_algorithm
-from curriculum.algorithms.base import Pick, Result
-from curriculum.task_space import AnyTask, Entry, Scales, TaskSpace
+from curriculum.algorithms.base import Drawn, Pick, Result
+from curriculum.task_space import AnyTask, Entry, Properties, Scales, Scaling, TaskSpace
 
 PARAMETERS = ("distance", "relative_angle", "lateral_offset", "approach_angle")
 VISIBLE = (*PARAMETERS, "agent_clearance", "goal_clearance")
@@ -68,9 +70,12 @@ class SyntheticWorld:
         self.space = SyntheticSpace(config)
         self.algorithm = make_algorithm(self.config, self.space)
         self.rng = np.random.default_rng(seed)
+        self._scaling = Scaling(self.space.inputs, self.space.scales)
         self.candidates = [self._draw() for _ in range(CANDIDATES)]
         for row, entry in enumerate(self.candidates):
             entry.row = row
+        properties = [entry.properties for entry in self.candidates]
+        self._scaled, self._x = self._scaling(properties), self._numbers(properties)
         self._exam = np.random.default_rng(7).uniform(size=(EXAMINED, len(PARAMETERS)))
         self.tasks = 0
 
@@ -79,8 +84,13 @@ class SyntheticWorld:
 
     def probability(self, entry: Entry, skill: float | None = None) -> float:
         """True success."""
-        x = np.array([[entry.properties[name] for name in PARAMETERS]])
+        x = self._numbers([entry.properties])
         return float(self._solve(x, self.skill if skill is None else skill)[0])
+
+    @staticmethod
+    def _numbers(properties: Sequence[Properties]) -> NDArray[np.float64]:
+        """Those of N tasks that difficulty depends on, (N, 4)."""
+        return np.array([[p[name] for name in PARAMETERS] for p in properties])
 
     @staticmethod
     def _solve(x: NDArray[np.float64], skill: float) -> NDArray[np.float64]:
@@ -91,13 +101,18 @@ class SyntheticWorld:
         """Over all tasks alike."""
         return float(self._solve(self._exam, self.skill).mean())
 
-    def draw(self, count: int) -> list[Entry]:
+    def draw(self, count: int) -> Drawn:
         """Candidates, each with the critic's noisy belief."""
-        chosen = [self.candidates[int(i)] for i in self.rng.permutation(CANDIDATES)[:count]]
-        for entry in chosen:
-            believed = self.probability(entry, self.skill - Q_LAG)
-            entry.q = 20 * believed - 10 + float(self.rng.normal(0, Q_NOISE))
-        return chosen
+        chosen = self.rng.permutation(CANDIDATES)[:count]
+        believed = self._solve(self._x[chosen], self.skill - Q_LAG)
+        q = 20 * believed - 10 + self.rng.normal(0, Q_NOISE, len(chosen))
+
+        def entry(index: int) -> Entry:
+            found = self.candidates[int(chosen[index])]
+            found.q = float(q[index])
+            return found
+
+        return Drawn(self._scaled[chosen], q, entry)
 
     def new(self, level: float = 1.0) -> Entry:
         """A task that was no candidate."""
@@ -109,9 +124,10 @@ class SyntheticWorld:
         p = self.probability(pick.entry)
         self.algorithm.report(Result(pick.entry, pick.category, pick.f, bool(self.rng.random() < p)))
         if pick.entry.row is not None:
-            fresh = self._draw()
-            fresh.row = pick.entry.row
-            self.candidates[fresh.row] = fresh
+            fresh, row = self._draw(), pick.entry.row
+            fresh.row, self.candidates[row] = row, fresh
+            self._scaled[row] = self._scaling([fresh.properties])[0]
+            self._x[row] = self._numbers([fresh.properties])[0]
         self.skill += self._growth * 4 * p * (1 - p)
         self.tasks += 1
         return pick

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common.cells import CELLS
 from common.config import Config
@@ -32,6 +33,22 @@ DOCKING_SCALES: Scales = {
 """m and rad."""
 NARROWEST = 0.25
 """Share of a parameter's range that level 0 leaves around its easiest value."""
+HUGE = 1e6
+"""Properties beyond it, from whoever asks for a score, count as it."""
+
+
+class Scaling:
+    """Brings the properties that f_pi sees to about [-1, 1]."""
+
+    def __init__(self, inputs: Sequence[str], scales: Scales) -> None:
+        self.names = tuple(name for name in inputs if name != "q")
+        self._centres, self._halves = np.array([scales[name] for name in self.names]).reshape(-1, 2).T
+
+    def __call__(self, properties: Sequence[Properties]) -> NDArray[np.float64]:
+        """Those of N tasks, (N, len(names)); KeyError for one without a property that is an input."""
+        values = np.array([p[name] for p in properties for name in self.names], float)
+        values = np.clip(values, -HUGE, HUGE).reshape(len(properties), len(self.names))
+        return np.asarray((values - self._centres) / self._halves)
 
 
 @dataclass(slots=True, eq=False)
@@ -50,18 +67,23 @@ class Entry:
     """In the database."""
     lease: float = 0.0
     """Until when it is in somebody's hands, seconds since 1970."""
+    _text: str = ""
 
-    def dump(self) -> list[Any]:
-        """The task and its geometry, as JSON can hold it."""
-        task = self.task.model_dump(mode="json") if isinstance(self.task, Task) else self.task
-        return [self.cell, task, dict(self.properties), self.poses]
+    @property
+    def text(self) -> str:
+        """Cell, task, properties and poses in JSON, made once; without what changes."""
+        if not self._text:
+            task = self.task.model_dump(mode="json") if isinstance(self.task, Task) else self.task
+            self._text = json.dumps([self.cell, task, dict(self.properties), self.poses])
+        return self._text
 
     @classmethod
-    def load(cls, values: list[Any]) -> Entry:
-        """What `dump` gave."""
-        cell, fields, properties, poses = values
+    def read(cls, text: str) -> Entry:
+        """That of a `text`."""
+        cell, fields, properties, poses = json.loads(text)
         task: AnyTask = Task.model_validate(fields) if "cell" in fields else fields
-        return cls(cell, task, properties, poses and (tuple(poses[0]), tuple(poses[1])))
+        poses = poses and (tuple(poses[0]), tuple(poses[1]))
+        return cls(cell, task, properties, poses, _text=text)
 
 
 class TaskSpace(ABC):

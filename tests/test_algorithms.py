@@ -6,18 +6,18 @@ from copy import copy
 
 import numpy as np
 import pytest
-import safetensors.torch
+import safetensors.numpy
 
 from common.config import VARIANTS, Config, resolve
 from common.messages import Category
 from curriculum.algorithms import make_algorithm
-from curriculum.algorithms.base import Algorithm, Pick, Result, State
+from curriculum.algorithms.base import Algorithm, Drawn, Pick, Result, State
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.algorithms.rnd import Rnd
 from curriculum.algorithms.schedule import Schedule
 from curriculum.algorithms.sfl import Sfl
 from curriculum.curriculum import Curriculum
-from curriculum.task_space import NARROWEST, Entry, TaskSpace, make_space
+from curriculum.task_space import NARROWEST, Entry, Scaling, TaskSpace, make_space
 from tests.helpers import small_config
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -51,7 +51,10 @@ class Pool:
     def __init__(self, space: TaskSpace, cell: int = 0, seed: int = 1) -> None:
         self.cell, self._space, self.rng = cell, space, np.random.default_rng(seed)
 
-    def draw(self, count: int) -> list[Entry]:
+    def draw(self, count: int) -> Drawn:
+        return Drawn.of(self.entries(count), Scaling(self._space.inputs, self._space.scales))
+
+    def entries(self, count: int) -> list[Entry]:
         return [self.new() for _ in range(min(count, 100))]
 
     def new(self, level: float = 1.0) -> Entry:
@@ -96,8 +99,8 @@ class Setting:
 def through_files(algorithm: Algorithm) -> State:
     """A snapshot as the database gives it back."""
     state = algorithm.snapshot()
-    tensors = safetensors.torch.load(safetensors.torch.save(state.tensors))
-    return State(tensors, json.loads(json.dumps(dict(state.values))))
+    arrays = safetensors.numpy.load(safetensors.numpy.save(state.arrays))
+    return State(arrays, json.loads(json.dumps(dict(state.values))))
 
 
 # All of them
@@ -132,8 +135,8 @@ def test_restored_algorithm_has_the_same_snapshot(overrides):
     setting.live(50)
     one, two = through_files(setting.algorithm), through_files(setting.twin().algorithm)
     assert one.values == two.values
-    assert one.tensors.keys() == two.tensors.keys()
-    assert all((one.tensors[name] == two.tensors[name]).all() for name in one.tensors)
+    assert one.arrays.keys() == two.arrays.keys()
+    assert all((one.arrays[name] == two.arrays[name]).all() for name in one.arrays)
 
 
 @pytest.mark.parametrize("overrides", ALL.values(), ids=ALL)
@@ -202,7 +205,7 @@ def test_rnd_draws_from_all_of_the_distribution_and_learns_nothing():
     counts, _ = np.histogram([task["x"] for _, task in found], 8, (0, 8))
     assert ((counts - 50) ** 2 / 50).sum() < 18.48  # 7 degrees of freedom, 1%
     state = setting.algorithm.snapshot()
-    assert (state.tensors, dict(state.values)) == ({}, {})
+    assert (state.arrays, dict(state.values)) == ({}, {})
 
 
 # The schedule
@@ -436,7 +439,7 @@ def test_number_of_draws_is_the_configured_one():
 def test_mu_and_sigma_are_those_of_the_tasks_that_were_drawn():
     setting = trained(*RANDOM)
     twin = setting.twin()
-    sample = twin.pool.draw(setting.config.curriculum.filter_samples)
+    sample = twin.pool.entries(setting.config.curriculum.filter_samples)
     f = setting.algorithm.score([e.properties for e in sample], [None] * len(sample))
     pick = setting.propose()
     assert (pick.mu, pick.sigma) == pytest.approx((f.mean(), f.std()))
@@ -455,16 +458,16 @@ def test_calibration_corrects_what_is_proposed_and_scored():
     assert pick.f == pytest.approx(setting.algorithm.score([pick.entry.properties], [None])[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("damage", ["tensor", "value", "shape"])
+@pytest.mark.parametrize("damage", ["array", "value", "shape"])
 def test_state_that_does_not_fit_is_refused(damage):
     setting = trained()
     state = through_files(setting.algorithm)
-    tensors, values = dict(state.tensors), dict(state.values)
-    if damage == "tensor":
-        del tensors["reservoir"]
+    arrays, values = dict(state.arrays), dict(state.values)
+    if damage == "array":
+        del arrays["reservoir"]
     elif damage == "value":
         del values["fits"]
     else:
-        tensors["net.0.weight"] = tensors["net.0.weight"][:, :1].contiguous()
+        arrays["net.0.weight"] = arrays["net.0.weight"][:, :1]
     with pytest.raises((KeyError, ValueError)):
-        make_algorithm(setting.config, setting.space).restore(State(tensors, values))
+        make_algorithm(setting.config, setting.space).restore(State(arrays, values))

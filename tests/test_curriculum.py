@@ -3,6 +3,7 @@ import math
 import sqlite3
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,13 @@ from common.tasks import Task, build_scene, geometric_properties
 from curriculum.algorithms.adaptive_filtering import task_type_probabilities
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.critic import CriticView
-from curriculum.curriculum import Curriculum, Gate
+from curriculum.curriculum import Curriculum, Gate, Report
 from curriculum.database import Database
 from curriculum.success_network import SuccessNetwork
-from curriculum.task_space import Entry, make_space
+from curriculum.task_space import Entry
 from tests.helpers import small_config
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 OPEN = "curriculum.gate.enabled=false"
 PLUS = small_config(OPEN)
 LETTER = small_config(OPEN, "curriculum.algorithm='navacl-q'", f"curriculum.inputs={[*GEOMETRIC[:4], 'q']}")
@@ -35,14 +37,6 @@ FEW, FEW_LETTER = (
     for config in (PLUS, LETTER)
 )
 """An empty database is soon made up for."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def make_candidate(config: Config, seed: int, cell: int = 0) -> Candidate:
@@ -100,8 +94,9 @@ def with_candidates(
 
 def value(curriculum: Curriculum, learner: Learner, version: Version | None = None) -> None:
     """Gives every candidate its Q under the weights of a learner."""
-    curriculum.critic.load(version or Version(epoch=1), learner.tensors())
-    curriculum.critic.refresh(curriculum.stale())
+    curriculum.load_critic(version or Version(epoch=1), learner.tensors())
+    for cell, rows in curriculum.stale(5):
+        curriculum.refresh(cell, rows, nullcontext())
 
 
 def outcome_of(proposal: Proposal, success: bool) -> Outcome:
@@ -115,7 +110,12 @@ def task_of(proposal: Proposal) -> Task:
 
 def seeds_in(curriculum: Curriculum, cell: int = 0) -> list[int]:
     """Of a cell's candidates, oldest first."""
-    return [entry.task.seed for entry in curriculum.cells[cell].entries.values()]
+    return [task.seed for task in tasks_in(curriculum, cell)]
+
+
+def tasks_in(curriculum: Curriculum, cell: int = 0) -> list[Task]:
+    held = curriculum.cells[cell]
+    return [held.entry(row).task for row in held.table.row.tolist()]
 
 
 def network_of(curriculum: Curriculum) -> SuccessNetwork:
@@ -193,17 +193,17 @@ def test_only_outcomes_of_favourable_starts_open_the_gate():
     favourable = curriculum.propose(0, 0)
     for seq in range(8):  # of nobody's proposal, and of one that is not known here
         unserved = outcome_of(favourable, True).model_copy(update={"proposal": (None, f"p-{seq}")[seq % 2]})
-        curriculum.report(unserved, origin(seq))
+        curriculum.report([Report(unserved, origin(seq))])
     assert list(curriculum.gate.outcomes) == []
     for seq in range(4):
         proposal = favourable if seq == 0 else curriculum.propose(0, 0)
         assert proposal.category == "gate"
         assert not curriculum.gate.open
-        curriculum.report(outcome_of(proposal, True), origin(8 + seq))
+        curriculum.report([Report(outcome_of(proposal, True), origin(8 + seq))])
     assert curriculum.gate.open
     after = curriculum.propose(0, 0)
     assert after.category in ("easy", "frontier", "random")
-    curriculum.report(outcome_of(after, True), origin(12))
+    curriculum.report([Report(outcome_of(after, True), origin(12))])
     assert len(curriculum.gate.outcomes) == 4
     assert curriculum.outcomes == 13
     on_record = [outcome.result.category for outcome in curriculum.database.outcomes()]
@@ -214,7 +214,7 @@ def test_outcome_counts_once_for_each_proposal():
     curriculum = Curriculum(gated(window=4))
     proposal = curriculum.propose(0, 0)
     for seq in range(3):
-        curriculum.report(outcome_of(proposal, True), origin(seq))
+        curriculum.report([Report(outcome_of(proposal, True), origin(seq))])
     assert (curriculum.outcomes, list(curriculum.gate.outcomes)) == (1, [True])
 
 
@@ -225,9 +225,9 @@ def test_outcome_is_learned_with_what_the_proposal_was_made_of():
     proposal = curriculum.propose(0, 0)
     value(curriculum, new, Version(epoch=2))
     assert new.q(candidates[task_of(proposal).seed]) != proposal.q
-    curriculum.report(outcome_of(proposal, True), origin(1))
+    curriculum.report([Report(outcome_of(proposal, True), origin(1))])
     unserved = Task(cell=3, seed=8, start=PLUS.world.start)
-    curriculum.report(Outcome(proposal=None, task=unserved, success=False), origin(2))
+    curriculum.report([Report(Outcome(proposal=None, task=unserved, success=False), origin(2))])
     first, second = (outcome.result for outcome in curriculum.database.outcomes())
     assert (first.entry.properties, first.entry.q) == (proposal.properties, proposal.q)
     assert (first.category, first.f, first.success) == (proposal.category, proposal.f, True)
@@ -249,7 +249,7 @@ def test_rnd_proposes_the_full_distribution_and_uses_neither_f_nor_q():
         assert task_of(proposal).start == RND.world.start
         assert (proposal.q, proposal.f, proposal.mu, proposal.sigma) == (None, None, None, None)
         assert (proposal.q_reason, proposal.q_version) == ("not used by rnd", None)
-        curriculum.report(outcome_of(proposal, True), origin(seq + 1))
+        curriculum.report([Report(outcome_of(proposal, True), origin(seq + 1))])
         seeds.add(task_of(proposal).seed)
     assert len(seeds) == 40
     assert not seeds & set(candidates)
@@ -295,54 +295,70 @@ def test_q_is_the_minimum_of_the_twin_critics_at_the_greedy_action(config):
     assert len(found) == 6
 
 
-def observed(config: Config, candidate: Candidate) -> Entry:
-    entry = make_space(config).entry(candidate.task)
-    entry.observed = candidate
-    return entry
-
-
 def test_q_end_to_end_is_that_of_the_encoded_frame():
     config = small_config(OPEN, "encoder.end_to_end=true")
     learner, view = Learner(config), CriticView(config)
     candidate = make_candidate(config, 3)
-    entry = observed(config, candidate)
-    view.load(Version(epoch=1), learner.tensors())
-    view.refresh([entry])
+    view.load(learner.tensors())
+    (q,) = view.value([candidate])
     assert learner.perception.encoder is not None
     frames = torch.from_numpy(np.stack([candidate.visual] * 4))[None]
     with torch.no_grad():
         code = learner.perception.encoder.encode_stacks(frames)[0].numpy()
         encoded = candidate.model_copy(update={"visual": code[: len(code) // learner.layout.stack]})
     assert np.array_equal(code, np.tile(encoded.visual, 4))
-    assert entry.q == pytest.approx(learner.q(encoded), abs=1e-4)
+    assert q == pytest.approx(learner.q(encoded), abs=1e-4)
 
 
-def valued(view: CriticView, entries: list[Entry]) -> list[float | None]:
-    view.refresh(entries)
-    return [entry.q for entry in entries]
+def q_of(curriculum: Curriculum) -> list[float | None]:
+    """Of the candidates of cell 0, oldest first."""
+    cell = curriculum.cells[0]
+    return [cell.entry(row).q for row in cell.table.row.tolist()]
 
 
-def test_q_is_cached_until_weights_of_another_version_come():
-    view, candidates = CriticView(PLUS), [make_candidate(PLUS, seed) for seed in range(4)]
-    entries = [observed(PLUS, c) for c in candidates]
-    bare = make_space(PLUS).entry(candidates[0].task)
-    assert valued(view, [*entries, bare]) == [None] * 5
+def test_q_is_kept_until_weights_of_another_version_come():
+    curriculum, candidates = with_candidates(PLUS, 2)
+    assert q_of(curriculum) == [None, None]
+    assert curriculum.stale(5) == [], "nothing could be newer without weights"
     old, new = Learner(PLUS, 1), Learner(PLUS, 2)
-    view.load(Version(epoch=1, counter=9), old.tensors())
-    first = valued(view, entries[:2])
-    assert first == pytest.approx([old.q(c) for c in candidates[:2]], abs=1e-5)
-    view.load(Version(epoch=1, counter=9), new.tensors())  # the same version: what is known stays
-    mixed = [*first, *(new.q(c) for c in candidates[2:])]
-    assert valued(view, entries) == pytest.approx(mixed, abs=1e-5)
-    view.load(Version(epoch=2, counter=0), new.tensors())
-    assert valued(view, [*entries, bare]) == [*(pytest.approx(new.q(c), abs=1e-5) for c in candidates), None]
-    assert entries[0].q_version == Version(epoch=2, counter=0)
+    value(curriculum, old, Version(epoch=1, counter=9))
+    first = [old.q(c) for c in candidates.values()]
+    assert q_of(curriculum) == pytest.approx(first, abs=1e-5)
+    later = [make_candidate(PLUS, seed) for seed in (2, 3)]
+    add(curriculum, *later, seq=1)
+    value(curriculum, new, Version(epoch=1, counter=9))  # the same version: what is known stays
+    assert q_of(curriculum) == pytest.approx([*first, *map(new.q, later)], abs=1e-5)
+    value(curriculum, new, Version(epoch=2, counter=0))
+    assert q_of(curriculum) == pytest.approx([new.q(c) for c in (*candidates.values(), *later)], abs=1e-5)
+    assert curriculum.propose(0, 0).q_version == "2.0"
+
+
+@pytest.mark.parametrize("moment", [1, 2, 3])
+def test_candidate_that_leaves_while_its_q_is_computed_takes_no_others_place(file, moment):
+    config, learner = PLUS, Learner(PLUS)
+    candidates = {seed: make_candidate(config, seed) for seed in range(4)}
+    add(Curriculum(config, Database(file)), *candidates.values())
+    curriculum = Curriculum(config, Database(file))  # whose start observations are still to be read
+    curriculum.load_critic(Version(epoch=1), learner.tensors())
+    ((cell, rows),) = curriculum.stale(5)
+    proposal, times = curriculum.propose(0, 0), []
+
+    class Lock(nullcontext):
+        def __enter__(self):
+            times.append(1)
+            if len(times) == moment:
+                curriculum.report([Report(outcome_of(proposal, True), origin(1))])
+
+    curriculum.refresh(cell, rows, Lock())
+    assert len(times) == 3
+    left = [learner.q(c) for seed, c in candidates.items() if seed != task_of(proposal).seed]
+    assert q_of(curriculum) == pytest.approx(left, abs=1e-5)
 
 
 def test_weights_that_do_not_fit_are_refused_naming_the_tensor():
     other = small_config("network.hidden=[24, 16]")
     with pytest.raises(ValueError, match=r"tensor policy\.net\.fusion\.bias is of shape \(1, 1, 24\)"):
-        CriticView(PLUS).load(Version(), Learner(other).tensors())
+        Curriculum(PLUS).load_critic(Version(), Learner(other).tensors())
 
 
 @pytest.mark.parametrize("config", [PLUS, LETTER])
@@ -407,7 +423,7 @@ def test_proposed_candidates_are_in_nobody_elses_hands_and_leave_the_database_wh
     assert sorted(task_of(p).seed for p in proposals) == sorted(candidates)
     assert len(curriculum) == curriculum.snapshot().leases == 30
     assert task_of(curriculum.propose(0, 0)).seed not in candidates
-    curriculum.report(outcome_of(proposals[3], True), origin(1))
+    curriculum.report([Report(outcome_of(proposals[3], True), origin(1))])
     assert seeds_in(curriculum) == [seed for seed in range(30) if seed != task_of(proposals[3]).seed]
     assert curriculum.snapshot().leases == 30, "one of them of a task made up by geometry"
 
@@ -418,7 +434,7 @@ def test_proposed_candidate_that_nobody_reports_is_proposed_again():
     proposals = [curriculum.propose(0, 0) for _ in range(20)]
     assert Counter(task_of(p).seed for p in proposals).keys() == {0, 1}
     last = task_of(proposals[-1]).seed
-    curriculum.report(outcome_of(proposals[-1], True), origin(1))
+    curriculum.report([Report(outcome_of(proposals[-1], True), origin(1))])
     assert seeds_in(curriculum) == [1 - last]
 
 
@@ -438,15 +454,16 @@ def test_database_holds_a_bounded_number_per_cell_and_the_oldest_make_room():
     add(curriculum, make_candidate(config, 100, cell=1), seq=1)
     assert len(curriculum) == 6
     assert (seeds_in(curriculum, 0), seeds_in(curriculum, 1)) == ([3, 4, 5, 6, 7], [100])
-    kept = curriculum.database.candidates("")
-    assert [entry.task.seed for entry in kept if isinstance(entry.task, Task)] == [3, 4, 5, 6, 7, 100]
+    kept = [Entry.read(text).task for _, text in curriculum.database.candidates("")]
+    assert [task.seed for task in kept if isinstance(task, Task)] == [3, 4, 5, 6, 7, 100]
 
 
 def test_draws_are_different_candidates_in_random_order():
     curriculum, _ = with_candidates(PLUS, 20)
     first: Counter[int] = Counter()
     for _ in range(400):
-        seeds = [entry.task.seed for entry in curriculum.cells[0].draw(5)]
+        drawn = curriculum.cells[0].draw(5)
+        seeds = [drawn.entry(i).task.seed for i in range(5)]
         assert len(set(seeds)) == 5
         first[seeds[0]] += 1
     assert sum((first[seed] - 20) ** 2 / 20 for seed in range(20)) < 36.19  # 19 degrees of freedom, 1%
@@ -490,7 +507,7 @@ def played(config: Config, file: Path, outcomes: int, successes: int) -> Curricu
     """A curriculum that has proposed and heard so much, the successes first."""
     curriculum = Curriculum(config, Database(file))
     for i in range(outcomes):
-        curriculum.report(outcome_of(curriculum.propose(i % 9, 0), i < successes), origin(i))
+        curriculum.report([Report(outcome_of(curriculum.propose(i % 9, 0), i < successes), origin(i))])
     return curriculum
 
 
@@ -538,7 +555,7 @@ def test_restored_candidates_keep_their_observations_and_leases_but_not_those_of
     found = {task_of(p).seed: p.q for p in (restored.propose(0, 0) for _ in range(3))}
     assert sorted(found) == free
     assert [found[seed] for seed in free] == pytest.approx([learner.q(candidates[s]) for s in free], abs=1e-5)
-    restored.report(outcome_of(taken, True), origin(1))
+    restored.report([Report(outcome_of(taken, True), origin(1))])
     assert seeds_in(restored) == free
     restored.database.close()
     assert len(Curriculum(PLUS, Database(file), encoder="another")) == 0
@@ -550,7 +567,9 @@ def test_gate_that_has_opened_stays_open_after_a_restart(file):
     saved.save()
     for i in range(10):
         assert saved.propose(0, 0).category != "gate"
-        saved.report(Outcome(proposal=None, task=make_candidate(config, i).task, success=False), origin(i))
+        saved.report(
+            [Report(Outcome(proposal=None, task=make_candidate(config, i).task, success=False), origin(i))]
+        )
     saved.database.close()
     restored = Curriculum(config, Database(file))
     assert restored.gate.open
@@ -569,7 +588,7 @@ def test_state_of_another_algorithm_is_learned_again_from_the_outcomes_on_record
     saved.save()
     saved.database.close()
     other = Curriculum(PLUS, Database(file))
-    assert "another algorithm than before" in caplog.text
+    assert "another algorithm or format than before" in caplog.text
     expected = Curriculum(PLUS)
     for result in results:
         network_of(expected).add(result.entry.properties, result.entry.q, result.success)

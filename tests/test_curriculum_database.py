@@ -11,11 +11,11 @@ import pytest
 from common.config import Config
 from common.delivery import DuplicateFilter
 from common.errors import UsageError
-from common.messages import Candidate, Candidates, MessageError, Origin, Outcome, Proposal
+from common.messages import Candidate, Candidates, MessageError, Origin, Outcome, Proposal, decode
 from common.observation import ObservationLayout
 from common.tasks import Task
 from curriculum.algorithms.base import Pick, Result
-from curriculum.curriculum import Curriculum
+from curriculum.curriculum import Curriculum, Report
 from curriculum.database import SCHEMA, Database
 from curriculum.task_space import Entry, make_space
 from tests.helpers import largest_file, small_config, wait_until
@@ -93,10 +93,13 @@ def test_what_is_committed_survives_and_what_is_not_does_not(file):
     first.save_state("s", {"a": 2.5}, b"other")
     first.close()
     second = Database(file)
-    (found,) = second.candidates("e1")
-    assert (found.row, found.task, found.properties) == (kept.row, kept.task, kept.properties)
-    assert (found.observed.visual == kept.observed.visual).all()
-    assert (found.observed.lidar == kept.observed.lidar).all()
+    ((row, text),) = second.candidates("e1")
+    ((known, blob),) = second.observed([row])
+    found, start = Entry.read(text), decode(Candidate, blob)
+    assert known == row
+    assert (row, found.task, found.properties) == (kept.row, kept.task, kept.properties)
+    assert (start.visual == kept.observed.visual).all()
+    assert (start.lidar == kept.observed.lidar).all()
     assert second.leases() == {kept.row: kept.lease}
     assert [o.result.entry.task.seed for o in second.outcomes()] == [3]
     assert second.load_state("s") == ({"a": 1.5}, b"tensors")
@@ -174,10 +177,10 @@ def test_candidates_of_another_encoder_are_dropped():
     ours, theirs = observed(1), observed(2)
     database.add_candidate(ours, "ours")
     database.add_candidate(theirs, "theirs")
-    assert [e.task.seed for e in database.candidates("theirs")] == [2]
+    assert [row for row, _ in database.candidates("theirs")] == [theirs.row]
     database.drop_candidates_but("ours")
-    assert [e.task.seed for e in database.candidates("ours")] == [1]
-    assert list(database.candidates("theirs")) == []
+    assert [row for row, _ in database.candidates("ours")] == [ours.row]
+    assert database.candidates("theirs") == []
 
 
 def test_write_ahead_log_begins_again_after_a_checkpoint(file):
@@ -209,7 +212,7 @@ def test_origins_restore_a_filter_with_its_gaps(file):
     arrived = [origin(0), origin(4), origin(2), origin(7, "b2"), origin(1, "b1", "local/a2")]
     for one in arrived:
         seen.add(one)
-        database.keep_origin(seen, one)
+        database.keep_origins(seen)
     database.commit()
     database.close()
     restored = Database(file).origins()
@@ -386,7 +389,7 @@ def outcome_of(proposal: Proposal, success: bool = True) -> Outcome:
 
 
 def report(curriculum: Curriculum, proposal: Proposal, success: bool = True, seq: int = 1) -> None:
-    curriculum.report(outcome_of(proposal, success), origin(seq))
+    curriculum.report([Report(outcome_of(proposal, success), origin(seq))])
 
 
 def live(curriculum: Curriculum, tasks: int, first: int = 0) -> None:
@@ -403,12 +406,18 @@ def state_of(curriculum: Curriculum) -> dict[str, object]:
         "outcomes": curriculum.outcomes,
         "judged": list(curriculum.judged),
         "gate": (curriculum.gate.open, list(curriculum.gate.outcomes)),
-        "tensors": {name: value.numpy().tobytes() for name, value in learned.tensors.items()},
+        "arrays": {name: value.tobytes() for name, value in learned.arrays.items()},
         "values": json.dumps(dict(learned.values)),
-        "candidates": [[(row, e.lease) for row, e in cell.entries.items()] for cell in curriculum.cells],
+        "candidates": [(c.table.row.tolist(), c.table.lease.tolist()) for c in curriculum.cells],
         "leases": curriculum.database.leases(),
         "seen": sorted(curriculum.seen.state()),
     }
+
+
+def held(curriculum: Curriculum) -> list[int]:
+    """Seeds of the candidates of cell 0, oldest first."""
+    cell = curriculum.cells[0]
+    return [cell.entry(row).task.seed for row in cell.table.row.tolist()]
 
 
 def seeds(curriculum: Curriculum, count: int) -> list[int]:
@@ -432,8 +441,7 @@ def test_reported_candidate_is_gone_for_good(file):
     proposal = curriculum.propose(0, 0)
     report(curriculum, proposal)
     assert len(curriculum) == 1
-    (left,) = over(file, OPEN).cells[0].entries.values()
-    assert left.task.seed == 1 - proposal.task.seed
+    assert held(over(file, OPEN)) == [1 - proposal.task.seed]
 
 
 def test_candidate_that_nobody_reports_is_proposed_again(file):
@@ -441,8 +449,7 @@ def test_candidate_that_nobody_reports_is_proposed_again(file):
     deliver(curriculum, make_candidate(SHORT, 3))
     first = curriculum.propose(0, 0)
     assert first.task.seed == 3
-    (entry,) = curriculum.cells[0].entries.values()
-    wait_until(lambda: entry.lease <= time.time(), what="the end of the lease")
+    wait_until(lambda: curriculum.cells[0].table.lease.max() <= time.time(), what="the end of the lease")
     again = curriculum.propose(0, 0)
     assert again.task.seed == 3
     assert again.id != first.id
@@ -452,8 +459,7 @@ def test_outcome_after_its_lease_counts_as_any_other(file):
     curriculum = over(file, SHORT)
     deliver(curriculum, make_candidate(SHORT, 3))
     proposal = curriculum.propose(0, 0)
-    (entry,) = curriculum.cells[0].entries.values()
-    wait_until(lambda: entry.lease <= time.time(), what="the end of the lease")
+    wait_until(lambda: curriculum.cells[0].table.lease.max() <= time.time(), what="the end of the lease")
     report(curriculum, proposal)
     (outcome,) = curriculum.database.outcomes()
     assert (outcome.result.category, outcome.result.f) == (proposal.category, proposal.f)
@@ -464,13 +470,12 @@ def test_late_outcome_of_a_candidate_that_was_reported_before_drops_no_other(fil
     curriculum = over(file, SHORT)
     deliver(curriculum, make_candidate(SHORT, 3))
     first = curriculum.propose(0, 0)
-    (entry,) = curriculum.cells[0].entries.values()
-    wait_until(lambda: entry.lease <= time.time(), what="the end of the lease")
+    wait_until(lambda: curriculum.cells[0].table.lease.max() <= time.time(), what="the end of the lease")
     second = curriculum.propose(0, 0)
     report(curriculum, first, seq=1)
     deliver(curriculum, make_candidate(SHORT, 4), seq=2)
     report(curriculum, second, seq=3)
-    assert [e.task.seed for e in curriculum.cells[0].entries.values()] == [4]
+    assert held(curriculum) == [4]
     assert curriculum.outcomes == 2
 
 
@@ -495,7 +500,7 @@ def test_late_outcome_without_a_lease_is_learned_by_its_task(file):
 def test_outcome_of_no_curriculum_is_learned_by_its_task():
     curriculum = Curriculum(BOX)
     for seq in range(3):
-        curriculum.report(Outcome(proposal=None, task={"x": 1.0}, success=True), origin(seq))
+        curriculum.report([Report(Outcome(proposal=None, task={"x": 1.0}, success=True), origin(seq))])
     assert curriculum.outcomes == 3
     assert {o.result.category for o in curriculum.database.outcomes()} == {"unserved"}
 
@@ -505,7 +510,7 @@ def test_duplicate_report_counts_once(file):
     proposal = curriculum.propose(0, 0)
     report(curriculum, proposal, True, seq=0)
     before = state_of(curriculum)
-    curriculum.report(outcome_of(proposal, False), origin(0, "b2"))
+    curriculum.report([Report(outcome_of(proposal, False), origin(0, "b2"))])
     assert state_of(curriculum) | {"seen": 0} == before | {"seen": 0}
     assert curriculum.seen.seen(origin(0, "b2"))
     assert [o.result.success for o in curriculum.database.outcomes()] == [True]
@@ -516,7 +521,7 @@ def test_outcome_of_an_impossible_task_is_refused_and_changes_nothing(task):
     curriculum = Curriculum(BOX)
     before = state_of(curriculum)
     with pytest.raises(MessageError, match=r"^task: "):
-        curriculum.report(Outcome(proposal="p", task=task, success=True), origin(0))
+        curriculum.report([Report(Outcome(proposal="p", task=task, success=True), origin(0))])
     assert state_of(curriculum) == before
 
 
@@ -534,8 +539,8 @@ def test_oldest_candidate_of_a_full_cell_makes_room_on_disk_too(file):
         deliver(curriculum, make_candidate(config, seed), seq=seed)
     deliver(curriculum, make_candidate(config, 9, cell=1), seq=5)
     for found in (curriculum, over(file, config)):
-        assert [e.task.seed for e in found.cells[0].entries.values()] == [2, 3, 4]
-        assert [len(cell.entries) for cell in found.cells] == [3, 1, *[0] * 7]
+        assert held(found) == [2, 3, 4]
+        assert [len(cell) for cell in found.cells] == [3, 1, *[0] * 7]
 
 
 # Restarts
@@ -612,8 +617,8 @@ def test_another_algorithm_learns_from_the_outcomes_there_are(file):
     fresh = Curriculum(letter)
     for seq, outcome in enumerate(first.database.outcomes()):
         message = Outcome(proposal=None, task=outcome.result.entry.task, success=outcome.result.success)
-        fresh.report(message, origin(seq))
-    assert state_of(changed)["tensors"] == state_of(fresh)["tensors"]
+        fresh.report([Report(message, origin(seq))])
+    assert state_of(changed)["arrays"] == state_of(fresh)["arrays"]
 
 
 def test_candidates_of_another_encoder_are_gone_after_a_restart(file):
@@ -630,7 +635,7 @@ def test_candidates_of_another_encoder_are_gone_after_a_restart(file):
 def test_messages_are_known_after_a_restart(file):
     first = over(file)
     live(first, 3)
-    first.report(Outcome(proposal=None, task={"x": 1.0}, success=True), origin(7))
+    first.report([Report(Outcome(proposal=None, task={"x": 1.0}, success=True), origin(7))])
     second = over(file)
     assert [second.seen.seen(origin(seq)) for seq in range(9)] == [True] * 3 + [False] * 4 + [True, False]
 
@@ -669,3 +674,63 @@ def test_history_of_f_pi_is_kept(file):
     found = over(file).database.networks()
     assert [outcomes for outcomes, _, _ in found] == [204, 408]
     assert found[0][2] != found[1][2]
+
+
+def test_outcomes_that_are_taken_together_are_all_there_or_none(file):
+    curriculum = over(file, OPEN)
+    deliver(curriculum, *(make_candidate(OPEN, seed) for seed in range(4)))
+    proposals = [curriculum.propose(0, 0) for _ in range(3)]
+    reports = [Report(outcome_of(p), origin(seq)) for seq, p in enumerate(proposals, 1)]
+    impossible = Outcome(proposal=None, task={"y": 1.0}, success=True)
+    before = state_of(curriculum)
+    with pytest.raises(MessageError, match=r"^task: "):
+        curriculum.report([*reports, Report(impossible, origin(4))])
+    assert state_of(curriculum) == before
+    curriculum.report([*reports, Report(reports[0].outcome, origin(5))])
+    assert (curriculum.outcomes, len(curriculum)) == (3, 1)
+    for found in (curriculum, over(file, OPEN)):
+        assert [found.seen.seen(origin(seq)) for seq in range(7)] == [True] * 4 + [False, True, False]
+
+
+def test_q_is_known_after_a_restart_with_the_weights_it_is_from(file):
+    first = over(file, OPEN)
+    deliver(first, *(make_candidate(OPEN, seed, cell=seed % 2) for seed in range(5)))
+    rows = first.cells[0].table.row.tolist()
+    first.cells[0].value(rows[:2], np.array([-0.25, 1 / 3]), np.array([3, 7]))
+    first.save()
+    report(first, first.propose(0, 0))  # leaves after the save
+    second = over(file, OPEN)
+    left = {row: first.cells[0].entry(row).q for row in first.cells[0].table.row.tolist()}
+    assert {row: second.cells[0].entry(row).q for row in left} == left
+    assert len(left) == 2 and None in left.values()
+    proposal = second.propose(0, 0)
+    assert (proposal.q, proposal.q_version, proposal.q_reason) == (
+        next(q for q in left.values() if q is not None), "3.7", "critic",
+    )  # fmt: skip
+    assert second.propose(1, 0).q_reason == "no critic yet"
+
+
+def test_state_of_an_older_format_is_learned_again_from_the_outcomes(file, caplog):
+    first = over(file)
+    live(first, 40)
+    first.save()
+    first.database.close()
+    with sqlite3.connect(file) as other:  # before there was a format, kinds ended with the scales
+        other.execute("UPDATE states SET text = json_remove(text, '$.kind[4]') WHERE name = 'curriculum'")
+        other.execute("UPDATE states SET tensors = zeroblob(9) WHERE name = 'curriculum'")
+    other.close()
+    second = over(file)
+    assert "another algorithm or format than before" in caplog.text
+    assert second.outcomes == 40
+    assert second.algorithm.network.fits == 40 // BOX.curriculum.batch_size
+
+
+def test_candidates_beyond_a_smaller_bound_leave_with_the_next_that_comes(file):
+    first = over(file, OPEN)
+    deliver(first, *(make_candidate(OPEN, seed) for seed in range(5)))
+    smaller = small_config("curriculum.gate.enabled=false", "curriculum.store_per_cell=3")
+    second = over(file, smaller)
+    assert held(second) == [0, 1, 2, 3, 4]
+    deliver(second, make_candidate(OPEN, 5), seq=1)
+    for found in (second, over(file, smaller)):
+        assert held(found) == [3, 4, 5]

@@ -16,7 +16,7 @@ from common.config import Config, parse
 from common.messages import Origin, Outcome
 from curriculum.algorithms.base import Result
 from curriculum.calibration import brier_score
-from curriculum.curriculum import Curriculum
+from curriculum.curriculum import Curriculum, Report
 from curriculum.database import Database
 from curriculum.plots import (
     GRID,
@@ -83,7 +83,7 @@ def step(curriculum: Curriculum, n: int, rng: np.random.Generator, unserved: boo
     first = next(iter(p.properties.values()))
     done = bool(rng.random() < 1 / (1 + math.exp(first / 3 - 2 - n / 200)))
     message = Outcome(proposal=None if unserved else p.id, task=p.task, success=done)
-    curriculum.report(message, Origin(actor="local/a1", boot="b1", seq=n))
+    curriculum.report([Report(message, Origin(actor="local/a1", boot="b1", seq=n))])
     return ("unserved", p.properties, None, done) if unserved else (p.category, p.properties, p.f, done)
 
 
@@ -252,7 +252,7 @@ def ask_again(driven: Driven, outcomes: int, task: dict[str, float]) -> float:
     curriculum = Curriculum(config)
     for n, (_, properties, _, success) in enumerate(driven.outcomes[:outcomes]):
         message = Outcome(proposal=None, task=properties, success=success)
-        curriculum.report(message, Origin(actor="local/a1", boot="b1", seq=n))
+        curriculum.report([Report(message, Origin(actor="local/a1", boot="b1", seq=n))])
     return float(curriculum.algorithm.score([task], [None])[0])
 
 

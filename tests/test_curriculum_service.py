@@ -28,7 +28,7 @@ from common.messages import (
 )
 from common.networks import make_encoder
 from common.weights import pack
-from curriculum.curriculum import Curriculum
+from curriculum.curriculum import Curriculum, Report
 from curriculum.database import Database
 from curriculum.service import CurriculumService
 from deploy.cli.main import app
@@ -142,6 +142,17 @@ def test_outcomes_that_come_together_are_taken_one_by_one(client, started):
     assert "contract differs in 'reward'" in receipt.answers[1]
     assert list(service.curriculum.gate.outcomes) == [True, False]
     assert duplicates(service) == [1, 0]
+
+
+def test_outcomes_that_come_together_are_committed_by_sixteens(client, started, tmp_path, monkeypatch):
+    service = started(OPEN, folder=tmp_path)
+    proposals, commits = query(client, count=40), []
+    commit = service.curriculum.database.commit
+    monkeypatch.setattr(service.curriculum.database, "commit", lambda: commits.append(commit()))
+    parcels = [parcel(outcome_of(proposal), seq) for seq, proposal in enumerate(proposals)]
+    assert deliver_all(client, KEYS.result, parcels).answers == [""] * 40
+    assert len(commits) == 3
+    assert service.curriculum.outcomes == 40
 
 
 def test_outcomes_open_the_gate_for_the_next_query(client, started):
@@ -263,7 +274,7 @@ def test_acknowledged_is_what_survives_a_service_that_is_killed(client, started,
         shutil.copy(tmp_path / f"curriculum.db{suffix}", dead)
     left = Curriculum(OPEN, Database(dead / "curriculum.db"))
     assert (left.outcomes, len(left), left.snapshot().leases) == (1, 2, 1)
-    left.report(outcome_of(waiting), Origin(actor="local/a1", boot="b1", seq=2))
+    left.report([Report(outcome_of(waiting), Origin(actor="local/a1", boot="b1", seq=2))])
     assert (left.outcomes, len(left), left.snapshot().leases) == (2, 1, 0)
     assert [outcome.result.category for outcome in left.database.outcomes()] == [
         taken.category,
@@ -276,7 +287,8 @@ def test_tasks_are_given_on_a_full_disk_and_what_could_not_be_kept_is_taken_late
     proposals = query(client, count=2)
     with largest_file(1000):
         assert [p.category for p in query(client, count=3)] == ["gate"] * 3
-        assert reason(deliver(client, KEYS.result, outcome_of(proposals[0]), 0)) == INTERNAL_ERROR
+        with pytest.raises(RefusedError, match=INTERNAL_ERROR):
+            deliver(client, KEYS.result, outcome_of(proposals[0]), 0)
         assert service._failed_writes == 1
         assert service.curriculum.outcomes == 0
         service.save()
@@ -322,8 +334,8 @@ def run_during(service: CurriculumService, action: Callable[[], None]) -> None:
 
 
 def valued_by(service: CurriculumService, version: Version) -> bool:
-    entries = list(service.curriculum.cells[0].entries.values())
-    return bool(entries) and all(entry.q_version == version for entry in entries)
+    versions = service.curriculum.cells[0].table.version.tolist()
+    return bool(versions) and all(found == [version.epoch, version.counter] for found in versions)
 
 
 def test_q_follows_the_weights_that_the_learner_publishes(hub, client):

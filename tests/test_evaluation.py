@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from actor.evaluation.examiner import Rival, Examiner, Terms, examine, identity
+from actor.evaluation.examiner import Examiner, Rival, Terms, examine, identity
 from actor.evaluation.measures import (
     Drive,
     axis_angle,

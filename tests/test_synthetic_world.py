@@ -83,19 +83,23 @@ def test_frontier_to_the_letter_lies_at_the_mean_and_so_among_hopeless_tasks_whe
     assert_above(uniform, found["frontier"])
 
 
-@pytest.mark.parametrize(
-    ("seeds", "tasks", "more"),
-    [((2,), 400, 0.25), pytest.param((1, 2, 3, 4), 1600, 0.1, marks=pytest.mark.slow)],
-    ids=["soon", "in the end"],
-)
-def test_brier_score_of_the_predictions_is_near_the_best(seeds, tasks, more):
-    """Of proposed tasks, before their outcomes; p (1 - p) is what nobody can predict away."""
-    algorithm = settings("navacl-q", "curriculum.calibrate=true")
-    worlds = [taught(SyntheticWorld(algorithm, seed=seed, **STILL), tasks) for seed in seeds]
+def excess(worlds: list[SyntheticWorld]) -> float:
+    """By how much the Brier score of 400 predictions each exceeds the best, as a share of it.
+
+    Of proposed tasks, before their outcomes; p (1 - p) is what nobody can predict away.
+    """
     picks = [(world.step(), world) for world in worlds for _ in range(400)]
     f, p = np.array([(pick.f, world.probability(pick.entry)) for pick, world in picks]).T
-    best = float(np.mean(p * (1 - p)))
-    assert np.mean((f - p) ** 2) + best < (1 + more) * best
+    return float(np.mean((f - p) ** 2) / np.mean(p * (1 - p)))
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(11, 15), pytest.param(range(11, 31), marks=pytest.mark.slow)], ids=["four", "twenty"]
+)
+def test_brier_score_is_within_a_tenth_of_the_best_after_800_outcomes(seeds):
+    """The settings were chosen on seeds 40 to 47; without them it is about a tenth, by seed more or less."""
+    config = settings("navacl-q", "curriculum.calibrate=true", "curriculum.average=0.99")
+    assert excess([taught(SyntheticWorld(config, seed=seed, **STILL), 800) for seed in seeds]) < 0.1
 
 
 @pytest.mark.slow

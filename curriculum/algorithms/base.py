@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from common.messages import Category, Requested
-from curriculum.task_space import Entry, Properties
+from curriculum.task_space import Entry, Properties, Scaling
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """N tasks that were drawn, as f_pi sees them; `entry` makes that of an index, when it is chosen."""
+
+    scaled: NDArray[np.float64]
+    """(N, P), see Scaling."""
+    q: NDArray[np.float64]
+    """(N,), NaN where it is not known."""
+    entry: Callable[[int], Entry]
+
+    @classmethod
+    def of(cls, entries: Sequence[Entry], scaling: Scaling) -> Drawn:
+        """Some that are there as a whole."""
+        scaled = scaling([entry.properties for entry in entries])
+        return cls(scaled, np.array([entry.q for entry in entries], float), entries.__getitem__)
 
 
 class Pool(Protocol):
@@ -19,7 +36,7 @@ class Pool(Protocol):
 
     cell: int
 
-    def draw(self, count: int) -> list[Entry]:
+    def draw(self, count: int) -> Drawn:
         """RandomTask, `count` times: from the cell's database, or by geometry alone while that is empty."""
 
     def new(self, level: float = 1.0) -> Entry:
@@ -48,9 +65,9 @@ class Result(NamedTuple):
 
 
 class State(NamedTuple):
-    """What an algorithm has learned: tensors, and what JSON can hold."""
+    """What an algorithm has learned: arrays, and what JSON can hold."""
 
-    tensors: dict[str, Tensor]
+    arrays: dict[str, NDArray[Any]]
     values: Mapping[str, Any]
 
 

@@ -89,13 +89,13 @@ class Sfl(Algorithm):
 
 def _dump(cell: _Cell) -> dict[str, Any]:
     def dump(level: _Level) -> list[Any]:
-        return [level.entry.dump(), level.asked, level.trials, level.successes]
+        return [level.entry.text, level.asked, level.trials, level.successes]
 
     kept, survey = map(dump, cell.kept), map(dump, cell.survey)
     return {"pause": cell.pause, "survey": list(survey), "kept": list(kept)}
 
 
 def _load(values: list[Any]) -> _Level:
-    level = _Level(Entry.load(values[0]))
+    level = _Level(Entry.read(values[0]))
     level.asked, level.trials, level.successes = map(int, values[1:])
     return level

@@ -8,6 +8,7 @@ the curriculum is killed and started again.
 
 from __future__ import annotations
 
+import os
 import queue
 import subprocess
 import sys
@@ -69,7 +70,7 @@ def bench_curriculum(
     report, rng = Report("curriculum"), np.random.default_rng(config.seed)
     config = override(config.model_dump(mode="json"), UPDATING)
     ours, limit, crowd = (list[float]() for _ in range(3))
-    ours_each, limit_each = list[float](), list[float]()
+    ours_each, limit_each, spent = list[float](), list[float](), 0.0
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder, endpoint = Path(name), f"tcp/127.0.0.1:{free_port()}"
         (folder / "config.toml").write_text(config.to_toml(), "utf-8")
@@ -96,7 +97,9 @@ def bench_curriculum(
                 window = _time(question)
                 times += window
                 each.append(float(np.mean(window)))
+            before = _cpu(child)
             crowd += actors_ask(rng)
+            spent += _cpu(child) - before
             progress(i + 1, "")
         updated = (int(members.learner["updates"]) - updates) / (time.monotonic() - began)
         away, lost = _kill(child, partial(ask, session, keys.snapshot, Nothing(), Snapshot, 1.0, PATIENCE))
@@ -107,6 +110,7 @@ def bench_curriculum(
     report.add("bare_queries_per_s", len(limit) / sum(limit), "1/s")
     report.add(f"actors_{actors}_asked_per_s", len(crowd) / (rounds * WINDOW), "1/s")
     report.add(f"actors_{actors}_unanswered", actors_ask.unanswered, "questions")
+    report.add(f"actors_{actors}_cpu_per_episode", 1000 * spent / len(crowd), "ms")
     report.add("learner_updates_per_s", updated, "1/s")
     report.add("restart_after_kill", away, "s")
     report.add("outcomes_lost_by_kill", lost, "outcomes")
@@ -157,6 +161,13 @@ def _drain(sender: Sender) -> None:
         if sender.refused or time.monotonic() > deadline:
             raise RunError(f"the curriculum does not take it: {sender.last_refusal or sender.trouble}")
         time.sleep(0.01)
+
+
+def _cpu(child: Child) -> float:
+    """Seconds of processor that a process has had."""
+    assert child.process is not None
+    fields = Path(f"/proc/{child.process.pid}/stat").read_text("ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _kill(child: Child, ask_state: Callable[[], Snapshot]) -> tuple[float, int]:

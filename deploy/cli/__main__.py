@@ -1,7 +1,9 @@
 """The command `navaclq`, also as `python -m deploy.cli`."""
 
+import os
 import signal
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's products are small here: two threads would spin
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # until a command handles it, Ctrl-C ends all without a word
 
 
