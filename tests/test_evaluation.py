@@ -35,6 +35,7 @@ from common.errors import UsageError
 from common.geometry import SE2
 from common.messages import ENDINGS
 from common.world_config import StartRanges
+from deploy.cli.evaluate import find_subject
 from tests.test_cli import call
 from tests.test_rollout import SMOKE, networks, save
 
@@ -316,6 +317,11 @@ def test_track_begins_at_the_start_and_follows_the_robot():
         assert drive.track[0, 3] == 0.0
         ways = np.hypot(*np.diff(drive.track[:, :2], axis=0).T)
         assert 0.05 < ways.max() <= 0.181
+
+
+def test_shipped_policy_docks_from_near_starts():
+    drives = examine(find_subject("shipped", CONFIG), suite("short").tasks[:22], 1)
+    assert [drive.ending for drive in drives].count("success") >= 15
 
 
 def test_networks_that_do_not_fit_their_configuration_are_refused(tmp_path):
