@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from actor.evaluation.measures import Drive, Measures
 from actor.evaluation.report import (
@@ -16,8 +17,11 @@ from actor.evaluation.report import (
     success_table,
 )
 from actor.evaluation.suites import Examination
-from common.config import resolve
+from common.world_config import WorldConfig
 from deploy.cli import options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def as_json_object(results: dict[str, Result], paired: dict[str, Any] | None) -> dict[str, Any]:
@@ -36,8 +40,9 @@ def as_lines(results: dict[str, Result], paired: dict[str, Any] | None) -> str:
     lines = []
     for label, result in results.items():
         how = "sampled" if result["sampled"] else "greedy"
-        lines.append(f"{label} on {result['suite']}, {result['episodes']} episodes, {how}\n")
-        lines += [f"  in a world of its own: {key} = {value}\n" for key, value in result["own_rules"].items()]
+        where = f" in the {result['arena']} arena" if "arena" in result else ""
+        lines.append(f"{label} on {result['suite']}{where}, {result['episodes']} episodes, {how}\n")
+        lines += [f"  not the default world: {key} = {value}\n" for key, value in result["own_rules"].items()]
         lines.append(as_text(result))
     if paired:
         low, high = (100 * bound for bound in paired["ci95"])
@@ -58,39 +63,44 @@ def as_lines(results: dict[str, Result], paired: dict[str, Any] | None) -> str:
 def write_report(
     out: Path,
     examination: Examination,
+    world: WorldConfig,
     driven: dict[str, list[Drive]],
     rows: dict[str, list[Measures]],
     results: dict[str, Result],
     paired: dict[str, Any] | None,
 ) -> None:
-    """Tables, episodes and, where matplotlib is installed, figures."""
-    name = examination.name
-    text = f"# {name}\n\n{success_table(results)}\n{measure_table(results)}"
-    if paired:
-        text += f"\n{as_lines(results, paired).splitlines()[-1]}\n"
-    options.write_file(out / f"{name}.md", text.encode())
-    for index, label in enumerate(driven):
-        file = out / f"{name}-{index}-{Path(label).name}.csv"
-        options.write_file(file, as_rows(examination.tasks, rows[label]).encode())
+    """Tables, episodes and, where matplotlib is installed, figures; scenes are drawn as in `world`."""
+    first = next(iter(results.values()))
+    how = "sampled" if first["sampled"] else "greedy"
+    title = ", ".join([examination.name, *([f"{first['arena']} arena"] if examination.is_grid else []), how])
+    stem = f"{title.replace(' arena', '').replace(', ', '-')}-seed{first['seed']}"
+    text = f"# {title}\n\n{success_table(results)}\n{measure_table(results)}\n"
+    if paired or len(results) > 1:
+        text += "```\n" + as_lines(results, paired) + "```\n"
+    options.write_file(out / f"{stem}.md", text.encode())
+    for index, name in enumerate(driven):
+        file = out / f"{stem}-{index}-{Path(name).name}.csv"
+        options.write_file(file, as_rows(examination.tasks, rows[name]).encode())
     try:
         from actor.evaluation import figures
     except ImportError:
         sys.stderr.write("no figures: they need matplotlib, pip install 'navaclq[plots]'\n")
         return
-    is_grid = name.startswith("grid-")
-    for index, (label, drives) in enumerate(driven.items()):
-        ending = f"{index}-{Path(label).name}.png"
-        title = f"{label} on {name}: {100 * results[label]['all']['success']:.1f}%"
-        if is_grid:
-            pictures = {
-                "map": figures.grid_map(examination.tasks, drives, title),
-                "failures": figures.failure_map(examination.tasks, drives, title),
-            }
+    tasks = examination.tasks
+    for index, (name, drives) in enumerate(driven.items()):
+        said = f"{name} on {title}: {100 * results[name]['all']['success']:.1f}%".replace("$", r"\$")
+        if examination.is_grid:
+            pictures = {"map": figures.grid_map(tasks, drives, said)}
+            pictures["failures"] = figures.failure_map(tasks, drives, said)
         else:
-            pictures = {"drives": figures.suite_map(drives, title)}
+            pictures = {"drives": figures.suite_map(drives, said)}
         for kind, picture in pictures.items():
-            picture.savefig(out / f"{name}-{kind}-{ending}", dpi=100)
-    world = resolve(overrides=examination.overrides).world
-    chosen = figures.pictured(examination.tasks)
-    picture = figures.trajectories(examination.tasks, driven, chosen, world)
-    picture.savefig(out / f"{name}-trajectories.png", dpi=100)
+            _write_figure(out / f"{stem}-{kind}-{index}-{Path(name).name}.png", picture)
+    ways = figures.trajectories(tasks, driven, figures.pictured(tasks), world)
+    _write_figure(out / f"{stem}-trajectories.png", ways)
+
+
+def _write_figure(file: Path, picture: Figure) -> None:
+    content = BytesIO()
+    picture.savefig(content, dpi=100)
+    options.write_file(file, content.getvalue())

@@ -185,8 +185,12 @@ RECORD = ("world", "record", "--policy", "b0")
         ),
         (
             ("evaluate", "b0", "--grid", "quick", "--nearest", "9.2"),
-            "the grid leaves the arena validation: the start -2.5, -9.2 m from the dolly lies outside",
+            "the grid does not fit the arena: at -2.5, -9.2 m from the dolly there is no free start",
         ),
+        (("evaluate", "b0", "--grid", "quick", "--nearest", "0"), "there is no free start"),
+        (("evaluate", "b0", "--grid", "quick", "--nearest", "nan"), "--nearest"),
+        (("evaluate", "nosuch", "--out", "x"), "policy nosuch does not exist"),
+        (("evaluate", "b0", "--compare", "nosuch"), "policy nosuch does not exist"),
         (("evaluate", "b0", "--nearest", "2"), "--nearest says where a grid is"),
         (("evaluate", "b0", "b0"), "the same policy is named twice"),
         (("evaluate", "b0", "b1", "--compare", "b2"), "--compare compares one policy with another"),

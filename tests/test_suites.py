@@ -174,3 +174,11 @@ def test_support_of_training_is_what_training_draws():
         (0.0, 3.0, 0.0, False),
     ):
         assert is_inside_training_support(PlacedStart(x=x, y=y, yaw=yaw), ranges) is inside, (x, y, yaw)
+
+
+def test_support_knows_that_an_angle_is_the_same_a_turn_further():
+    """With starts in all headings it is the same on either side of the dolly."""
+    ranges = StartRanges(yaw=180)
+    for x in (-1.4, -0.7, 0.7, 1.4):
+        for yaw in (-180, -135, 0, 135, 180):
+            assert is_inside_training_support(PlacedStart(x=x, y=-2.5, yaw=yaw), ranges), (x, yaw)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 import numpy as np
+import safetensors.torch
 import torch
 
 from actor.baseline.registry import make_baseline
@@ -19,11 +21,11 @@ from actor.rollout import Rollout
 from actor.world.world import DockingWorld
 from common.cells import CELLS
 from common.config import Config, override
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.files import content_hash
 from common.messages import Version
 from common.networks import load_state, make_encoder
-from common.policy_files import CONFIG, NETWORKS, load_policy
+from common.policy_files import NETWORKS, load_policy
 from common.tasks import Task
 
 CHUNK = 22
@@ -33,17 +35,40 @@ SLOTS = len(CELLS)
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """Stands for a policy: a baseline by its name, in the world of `config`."""
+    """A baseline by its name, in the world of `config`."""
 
     name: str
     config: Config
 
-    def __str__(self) -> str:
-        return self.name
+    @property
+    def identity(self) -> str:
+        """What it is by its content."""
+        return f"{self.name} {content_hash(self.config.to_toml().encode())}"
 
 
-Subject = Path | Rival
-"""Who is examined: the folder of a policy, or a baseline."""
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """A policy as read once from its folder, which may be replaced while it drives."""
+
+    name: str
+    config: Config
+    networks: bytes
+    """Safetensors."""
+
+    @classmethod
+    def read(cls, folder: Path) -> Trained:
+        """Raises UsageError when `folder` is no policy, or a damaged one."""
+        config, _ = load_policy(folder)
+        return cls(str(folder), config, (folder / NETWORKS).read_bytes())
+
+    @property
+    def identity(self) -> str:
+        """What it is by its content."""
+        return content_hash(self.config.to_toml().encode() + self.networks)
+
+
+Subject = Trained | Rival
+"""Who is examined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,35 +84,28 @@ class Terms:
     """By default the configured length of an evaluation."""
 
 
-def world_of(subject: Subject, terms: Terms = Terms()) -> Config:
-    """The configuration in which a subject drives; raises UsageError when there is none."""
-    config = subject.config if isinstance(subject, Rival) else load_policy(subject)[0]
-    return override(config.model_dump(mode="json"), terms.overrides) if terms.overrides else config
-
-
-def identity(subject: Subject) -> str:
-    """What a subject is by its content: a hash of a policy's files, or a baseline's name and world."""
-    if isinstance(subject, Rival):
-        return f"{subject.name} {content_hash(subject.config.to_toml().encode())}"
-    load_policy(subject)  # or a missing or damaged file would have no sentence
-    return content_hash((subject / CONFIG).read_bytes() + (subject / NETWORKS).read_bytes())
+def world_of(subject: Subject, terms: Terms) -> Config:
+    """The configuration in which a subject drives."""
+    return override(subject.config.model_dump(mode="json"), terms.overrides)
 
 
 def load_driver(subject: Subject, terms: Terms, slots: int) -> tuple[Rollout, Actor]:
-    """Worlds and what drives in them; raises UsageError when `subject` is no policy, or damaged."""
+    """Worlds and what drives in them; raises UsageError for networks that do not fit."""
     config = world_of(subject, terms)
     limit = terms.max_steps or config.world.max_evaluation_steps
     if isinstance(subject, Rival):
         rollout = Rollout(config, Blind(config), slots, limit)
         return rollout, make_baseline(subject.name, rollout)
-    encoder, tensors = make_encoder(config), load_policy(subject)[1]
+    encoder, tensors = make_encoder(config), safetensors.torch.load(subject.networks)
     actor = PolicyActor(config, slots, np.random.default_rng(0), terms.greedy)
     try:
         if not config.encoder.end_to_end:
             load_state(tensors, encoder=encoder)
         actor.load(Version(counter=1), tensors)
     except ValueError as error:
-        raise UsageError(f"{subject} holds other networks than its configuration says: {error}") from None
+        raise UsageError(
+            f"{subject.name} holds other networks than its configuration says: {error}"
+        ) from None
     for slot in range(slots):
         actor.refresh(slot)
     return Rollout(config, Eyes(config, encoder), slots, limit), actor
@@ -128,19 +146,64 @@ def _row(world: DockingWorld) -> tuple[float, ...]:
     return world.pose.x, world.pose.y, world.pose.yaw, sum(world.speeds) / 2
 
 
-_examiner: Examiner | None = None
+Piece = tuple[int, Sequence[Task]]
+"""Number of the first task, and tasks that drive side by side."""
 
 
-def _start_worker(subject: Subject, terms: Terms) -> None:
-    global _examiner
+def _work(pipe: Connection, subject: Subject, terms: Terms) -> None:
+    """A worker process: drives each piece that comes, until its parent has gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    _examiner = Examiner(subject, terms)
+    try:
+        examiner = Examiner(subject, terms)
+        while True:
+            first, tasks = pipe.recv()
+            try:
+                found: list[Drive] | UsageError = examiner.run(
+                    tasks, np.random.default_rng([terms.seed, 4, first])
+                )
+            except UsageError as error:
+                found = error
+            pipe.send((first, found))
+    except (EOFError, OSError):
+        return
 
 
-def _examine(work: tuple[int, Sequence[Task], int]) -> tuple[int, list[Drive]]:
-    assert _examiner is not None
-    first, tasks, seed = work
-    return first, _examiner.run(tasks, np.random.default_rng([seed, 4, first]))
+def _drive(
+    subject: Subject, terms: Terms, pieces: Sequence[Piece], processes: int
+) -> Iterator[tuple[int, list[Drive]]]:
+    """Pieces as they are driven. Raises UsageError for an impossible task, RunError when a worker dies."""
+    context = multiprocessing.get_context("spawn")
+    waiting, workers, busy = list(pieces)[::-1], [], list[Connection]()
+    try:
+        for _ in range(min(processes, len(pieces))):
+            ours, theirs = context.Pipe()
+            worker = context.Process(target=_work, args=(theirs, subject, terms), daemon=True)
+            workers.append(worker)
+            worker.start()
+            theirs.close()
+            ours.send(waiting.pop())
+            busy.append(ours)
+        while busy:
+            for pipe in wait(busy):
+                assert isinstance(pipe, Connection)
+                try:
+                    first, found = pipe.recv()
+                except (EOFError, OSError):
+                    raise RunError(
+                        "a worker process of the evaluation died; what was driven is kept, run it again"
+                    ) from None
+                if isinstance(found, UsageError):
+                    raise found
+                if waiting:
+                    pipe.send(waiting.pop())
+                else:
+                    busy.remove(pipe)
+                yield first, found
+    finally:
+        for worker in workers:
+            worker.terminate()
+        for worker in workers:
+            worker.join()
 
 
 def examine(
@@ -154,25 +217,17 @@ def examine(
     """The drives, in the tasks' order; `progress` hears the number done.
 
     What `work` holds already is not driven again, and everything that is driven is in it at once, a piece of
-    work as a whole. Raises UsageError for a bad subject or an impossible task.
+    work as a whole. Raises UsageError for networks that do not fit or an impossible task, RunError when a
+    worker dies.
     """
-    load_driver(subject, terms, 0)  # a bad one is refused here, not in a worker
+    load_driver(subject, terms, 0)  # what does not fit is refused here, not in a worker
     drives = work.load() if work else {}
-    pieces = [(i, tasks[i : i + CHUNK], terms.seed) for i in range(0, len(tasks), CHUNK)]
+    pieces = [(i, tasks[i : i + CHUNK]) for i in range(0, len(tasks), CHUNK)]
     missing = [piece for piece in pieces if any(piece[0] + k not in drives for k in range(len(piece[1])))]
-
-    def take(first: int, found: list[Drive]) -> None:
+    for done, found in _drive(subject, terms, missing, processes):
         if work:
-            work.add(first, found)
-        drives.update({first + k: drive for k, drive in enumerate(found)})
+            work.add(done, found)
+        drives.update({done + k: drive for k, drive in enumerate(found)})
         if progress:
             progress(len(drives))
-
-    if progress and drives:
-        progress(len(drives))
-    if missing:
-        context = multiprocessing.get_context("spawn")
-        with context.Pool(min(processes, len(missing)), _start_worker, (subject, terms)) as pool:
-            for first, found in pool.imap_unordered(_examine, missing):
-                take(first, found)
     return [drives[index] for index in range(len(tasks))]

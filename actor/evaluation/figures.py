@@ -48,8 +48,8 @@ def _positions(tasks: Sequence[Task], drives: Sequence[Drive]) -> Places:
     return found
 
 
-def _panels(title: str) -> tuple[Figure, list[Axes]]:
-    """One panel for each heading, with the dolly and an arrow that shows it."""
+def _panels(title: str, lowest: float) -> tuple[Figure, list[Axes]]:
+    """One panel for each heading, from the dolly down to `lowest` (m), with an arrow that shows it."""
     figure = Figure(figsize=(13, 7), layout="constrained")
     figure.suptitle(title)
     axes: list[Axes] = list(np.ravel(figure.subplots(2, 4, sharex=True, sharey=True)))
@@ -62,7 +62,7 @@ def _panels(title: str) -> tuple[Figure, list[Axes]]:
             xytext=(3.2 - 0.5 * ahead[0], -0.3 - 0.5 * ahead[1]),
             arrowprops={"arrowstyle": "->", "lw": 1.5},
         )
-        panel.set(xlim=(-3.2, 4.0), ylim=(-7.0, 1.0), aspect="equal")
+        panel.set(xlim=(-3.2, 4.0), ylim=(lowest - 0.5, 1.0), aspect="equal")
     for panel in axes[4:]:
         panel.set_xlabel("x from the dolly, m")
     for panel in (axes[0], axes[4]):
@@ -72,8 +72,9 @@ def _panels(title: str) -> tuple[Figure, list[Axes]]:
 
 def grid_map(tasks: Sequence[Task], drives: Sequence[Drive], title: str) -> Figure:
     """Success by start position in a panel for each heading, as the paper's figure of the grid test."""
-    figure, axes = _panels(title)
-    for panel, (heading, places) in zip(axes, _positions(tasks, drives).items(), strict=True):
+    found = _positions(tasks, drives)
+    figure, axes = _panels(title, min(y for places in found.values() for _, y in places))
+    for panel, (heading, places) in zip(axes, found.items(), strict=True):
         x, y = zip(*places, strict=True)
         success = [Counter(endings)["success"] / len(endings) for endings in places.values()]
         dots = panel.scatter(x, y, c=success, cmap="viridis", vmin=0.0, vmax=1.0, s=70, edgecolors="none")
@@ -84,8 +85,9 @@ def grid_map(tasks: Sequence[Task], drives: Sequence[Drive], title: str) -> Figu
 
 def failure_map(tasks: Sequence[Task], drives: Sequence[Drive], title: str) -> Figure:
     """The commonest failure of each start position, the mark's area by the share of failures."""
-    figure, axes = _panels(title)
-    for panel, (heading, places) in zip(axes, _positions(tasks, drives).items(), strict=True):
+    found = _positions(tasks, drives)
+    figure, axes = _panels(title, min(y for places in found.values() for _, y in places))
+    for panel, (heading, places) in zip(axes, found.items(), strict=True):
         for (x, y), endings in places.items():
             failures = Counter(ending for ending in endings if ending != "success")
             panel.scatter(x, y, s=6, color=COLOURS["success"] if not failures else "lightgray")

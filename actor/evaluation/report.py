@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from actor.evaluation.measures import Measures, conditional_value_at_risk, summarize
-from actor.evaluation.suites import GRID_HEADINGS, is_inside_training_support
+from actor.evaluation.suites import GRID_HEADINGS, Examination, is_inside_training_support
 from common.tasks import PlacedStart, Task
 from common.world_config import StartRanges
 
@@ -39,28 +39,32 @@ WORDS = {
 }
 
 
-def groups(tasks: Sequence[Task], drives: Sequence[Measures], ranges: StartRanges) -> Result:
+def groups(examination: Examination, drives: Sequence[Measures], ranges: StartRanges) -> Result:
     """Summaries of all drives, and of a grid's: by heading, inside (up to 90 deg) and outside the training
     range, and of the starts that training with `ranges` can draw (`support`, None when there are none).
     """
-    if not all(isinstance(task.start, PlacedStart) for task in tasks):
+    if not examination.is_grid:
         return {"all": summarize(drives)}
-    starts = [task.start for task in tasks if isinstance(task.start, PlacedStart)]
+    starts = [task.start for task in examination.tasks if isinstance(task.start, PlacedStart)]
 
     def of(chosen: list[bool]) -> Result:
-        picked = [index for index, is_in in enumerate(chosen) if is_in]
-        some = [drives[index] for index in picked]
-        positions = [(starts[index].x, starts[index].y) for index in picked]
-        return {**summarize(some), "cvar10": conditional_value_at_risk(some, positions)}
+        return summarize([drive for drive, is_in in zip(drives, chosen, strict=True) if is_in])
+
+    def with_risk(chosen: list[bool]) -> Result:
+        risk = conditional_value_at_risk(
+            [drive for drive, is_in in zip(drives, chosen, strict=True) if is_in],
+            [(start.x, start.y) for start, is_in in zip(starts, chosen, strict=True) if is_in],
+        )
+        return {**of(chosen), "cvar10": risk}
 
     inside = [abs(start.yaw) <= 90 for start in starts]
     support = [is_inside_training_support(start, ranges) for start in starts]
     found = {str(heading): [round(s.yaw) == heading for s in starts] for heading in GRID_HEADINGS}
     return {
-        "all": of([True] * len(starts)),
+        "all": with_risk([True] * len(starts)),
         "headings": {heading: of(chosen) for heading, chosen in found.items() if any(chosen)},
-        "inside": of(inside),
-        "outside": of([not is_in for is_in in inside]) if not all(inside) else None,
+        "inside": with_risk(inside),
+        "outside": with_risk([not is_in for is_in in inside]),
         "support": of(support) if any(support) else None,
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ class Examination:
     name: str
     tasks: tuple[Task, ...]
     overrides: tuple[str, ...] = ()
+    is_grid: bool = False
 
 
 def _cells(first: int, count: int, start: StartRanges) -> tuple[Task, ...]:
@@ -134,7 +136,7 @@ def grid(size: str, arena: str, seed: int = 0, nearest: float = NEAREST) -> Exam
     ]
     cell, first = arena_index(arena), 4 * FIRST_SUITE_SEED + seed * 2**20
     tasks = [Task(cell=cell, seed=first + i, start=s) for i, s in enumerate(starts * REPEATS[size])]
-    return Examination(f"grid-{size}", tuple(tasks))
+    return Examination(f"grid-{size}", tuple(tasks), is_grid=True)
 
 
 def is_inside_training_support(start: PlacedStart, ranges: StartRanges) -> bool:
@@ -147,6 +149,11 @@ def is_inside_training_support(start: PlacedStart, ranges: StartRanges) -> bool:
     if not ranges.distance_min <= distance <= ranges.distance_max:
         return False
     line = math.degrees(math.atan2(start.x, -start.y))
-    low = max(-ranges.dolly_yaw, -ranges.bearing - line, -ranges.yaw - start.yaw)
-    high = min(ranges.dolly_yaw, ranges.bearing - line, ranges.yaw - start.yaw)
-    return low <= high
+
+    def is_possible(line: float, yaw: float) -> bool:
+        low = max(-ranges.dolly_yaw, -ranges.bearing - line, -ranges.yaw - yaw)
+        high = min(ranges.dolly_yaw, ranges.bearing - line, ranges.yaw - yaw)
+        return low <= high
+
+    turns = itertools.product((-360.0, 0.0, 360.0), repeat=2)  # an angle is the same a turn further
+    return any(is_possible(line + a, start.yaw + b) for a, b in turns)

@@ -6,7 +6,7 @@ import json
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from actor.evaluation.measures import Drive
 from common.errors import UsageError
 from common.files import content_hash
 from common.geometry import SE2
-from common.messages import Ending
+from common.messages import ENDINGS, Ending
 
 SCHEMA = 1
 TABLES = """
@@ -61,7 +61,7 @@ class WorkList:
         query = "SELECT number, ending, dolly, track FROM episodes WHERE examination = ?"
         try:
             return {number: _drive(*rest) for number, *rest in self._sql.execute(query, (self.id,))}
-        except (sqlite3.DatabaseError, ValueError, TypeError) as error:
+        except (sqlite3.DatabaseError, ValueError, TypeError, RecursionError) as error:
             raise UsageError(f"{self._name} is damaged: {error}; remove it to drive again") from None
 
     def add(self, first: int, drives: Sequence[Drive]) -> None:
@@ -70,16 +70,18 @@ class WorkList:
             (self.id, first + k, d.ending, json.dumps([d.dolly.x, d.dolly.y, d.dolly.yaw]), d.track.tobytes())
             for k, d in enumerate(drives)
         ]
-        try:
-            with self._sql:
-                self._sql.executemany("INSERT OR IGNORE INTO episodes VALUES (?, ?, ?, ?, ?)", rows)
-        except sqlite3.DatabaseError as error:
-            raise UsageError(f"cannot write to {self._name}: {error}; what it holds is kept") from None
+        self._write("INSERT OR IGNORE INTO episodes VALUES (?, ?, ?, ?, ?)", rows)
 
     def forget(self) -> None:
         """Drops what was driven."""
-        with self._sql:
-            self._sql.execute("DELETE FROM episodes WHERE examination = ?", (self.id,))
+        self._write("DELETE FROM episodes WHERE examination = ?", [(self.id,)])
+
+    def _write(self, statement: str, rows: Sequence[tuple[Any, ...]]) -> None:
+        try:
+            with self._sql:
+                self._sql.executemany(statement, rows)
+        except sqlite3.DatabaseError as error:
+            raise UsageError(f"cannot write to {self._name}: {error}; what it holds is kept") from None
 
     def close(self) -> None:
         """Frees the file."""
@@ -88,10 +90,12 @@ class WorkList:
 
 def _drive(ending: Ending, dolly: str, track: bytes) -> Drive:
     """A row as a drive; ValueError when it is none."""
-    if ending not in get_args(Ending):
+    if ending not in ENDINGS:
         raise ValueError(f"{ending!r} is no ending")
     rows = np.frombuffer(track, np.float32).reshape(-1, 4)
     if not 2 <= len(rows) <= LONGEST or not np.isfinite(rows).all():
         raise ValueError("a track that cannot be")
     x, y, yaw = map(float, json.loads(dolly))
+    if not np.isfinite([x, y, yaw]).all():
+        raise ValueError("a dolly that cannot be")
     return Drive(ending, rows, SE2(x, y, yaw))

@@ -62,9 +62,10 @@ def train(
     exit_on_signals()
     load = _supervise(run, minutes or 40.0, actors, f"tcp/127.0.0.1:{port or free_port()}", asked, source)
     result = _summary(run, load)
+    _keep(run, result)
     if evaluation is not None:
         result["eval"] = _compare(run, evaluation, result["seed"])
-    (run / "result.json").write_text(json.dumps(result, indent=1), "utf-8")
+        _keep(run, result)
     if as_json:
         options.print_json(result)
     else:
@@ -181,9 +182,13 @@ def _summary(run: Path, load: float) -> dict[str, Any]:
     }
 
 
+def _keep(run: Path, result: dict[str, Any]) -> None:
+    options.write_file(run / "result.json", json.dumps(result, indent=1).encode())
+
+
 def _compare(run: Path, name: str, seed: int) -> dict[str, Any]:
     """Untrained against trained policy on a suite, greedy; outside the training's clock."""
-    from actor.evaluation.examiner import Terms
+    from actor.evaluation.examiner import Terms, Trained
     from actor.evaluation.measures import rates
 
     policies = {"before": run / "snapshots" / "initial", "after": run / "snapshots" / "final"}
@@ -191,8 +196,9 @@ def _compare(run: Path, name: str, seed: int) -> dict[str, Any]:
         raise UsageError(f"{missing[0]} is missing: nothing to evaluate")
     examination = suite(name)
     terms = Terms(seed=seed, overrides=examination.overrides)
+    work = run / "evaluation" / "episodes.db"
     found = {
-        label: rates([one.ending for one in drive(path, examination, terms, label)])
+        label: rates([one.ending for one in drive(Trained.read(path), examination, terms, work=work)])
         for label, path in policies.items()
     }
     return {"suite": name, "episodes": len(examination.tasks), **found}

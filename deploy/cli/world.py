@@ -156,7 +156,7 @@ def check(
         from actor.evaluation.suites import Examination
 
         examination = Examination("training starts", tuple(starts))
-        drives = drive(Rival("b0", resolved), examination, Terms(max_steps=limit), "b0", processes)
+        drives = drive(Rival("b0", resolved), examination, Terms(max_steps=limit), processes)
         found = rates([one.ending for one in drives])
         result["solved"] = {"tasks": solve, "max_steps": limit, **found}
         text += (
