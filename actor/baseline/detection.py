@@ -53,6 +53,7 @@ class DollyFinder:
         """The estimate; None while there is none."""
         self.place: tuple[float, float] | None = None
         """Roughly where the camera saw it last, m."""
+        self._age = 0
         self.is_sure = False
         """Whether the estimate is good enough to drive under the dolly."""
 
@@ -70,8 +71,12 @@ class DollyFinder:
 
     def _track(self, dolly: SE2) -> None:
         """Refines the estimate, or gives it up when the newest scans contradict it."""
-        near = self.legs.near(self._scans.latest(TRACKED), dolly.x, dolly.y)
-        refined = self.legs.refine(dolly, near, gate=0.04)
+        self._age += 1
+        refined = dolly
+        is_due = not self.is_sure or self._age % 3 == 0
+        if is_due:
+            near = self.legs.near(self._scans.latest(TRACKED), dolly.x, dolly.y)
+            refined = self.legs.refine(dolly, near, gate=0.04)
         recent = self.legs.near(self._scans.latest(RECENT), refined.x, refined.y)
         fit = self.legs.fit(_row(refined), recent, MIDDLE)
         if fit.against[0] >= 3 and fit.against[0] > fit.hits[0]:
@@ -83,10 +88,11 @@ class DollyFinder:
             self._lose(dolly)
             return
         self.dolly = refined
-        whole = self.legs.fit(_row(refined), near, FINE)
-        self.is_sure = bool(
-            whole.legs[0] >= 3 and whole.hits[0] >= 10 and whole.against[0] <= 0.1 * whole.hits[0]
-        )
+        if is_due:
+            fit = self.legs.fit(_row(refined), near, FINE)
+            self.is_sure = bool(
+                fit.legs[0] >= 3 and fit.hits[0] >= 10 and fit.against[0] <= 0.1 * fit.hits[0]
+            )
 
     def _lose(self, dolly: SE2) -> None:
         """Forgets the dolly and what was seen of it: it has been moved, or never stood there."""

@@ -195,16 +195,27 @@ def plan(start: SE2, dolly: SE2, solids: Sequence[Rectangle], world: WorldConfig
 
 
 def plan_to(start: SE2, goals: Sequence[SE2], solids: Sequence[Rectangle], world: WorldConfig) -> list[SE2]:
-    """A quick free path from `start` to that goal which is the soonest reached; empty when none was found."""
+    """A quick free path from `start` to that goal which is the soonest reached; empty when none was found.
+
+    It gives up soon, as the goals may be beyond walls.
+    """
     space = FreeSpace(solids, None, start, world)
     ends = [Entry(goal, 0.0, 0.0) for goal in goals]
-    return _Search(start.yaw, space, ends, world.robot).run(start)[:-1] if ends else []
+    return _Search(start.yaw, space, ends, world.robot, EXPANSIONS // 10).run(start)[:-1] if ends else []
 
 
 class _Search:
     """A* over turns and drives; whether a move is free is asked only when its turn comes."""
 
-    def __init__(self, yaw: float, space: FreeSpace, ways_in: list[Entry], robot: RobotConfig) -> None:
+    def __init__(
+        self,
+        yaw: float,
+        space: FreeSpace,
+        ways_in: list[Entry],
+        robot: RobotConfig,
+        expansions: int = EXPANSIONS,
+    ) -> None:
+        self._expansions = expansions
         self._yaw, self._space, self._ways_in = yaw, space, ways_in
         self._goals = np.array([(e.pose.x, e.pose.y, e.pose.yaw) for e in ways_in])
         self._times = np.array([e.time for e in ways_in])
@@ -220,7 +231,7 @@ class _Search:
     def run(self, start: SE2) -> list[SE2]:
         """The first path that is found; empty when there is none, or when the search gives up."""
         self._expand([start], 0.0)
-        while self._waiting and len(self._paths) < EXPANSIONS:
+        while self._waiting and len(self._paths) < self._expansions:
             _, _, node = heapq.heappop(self._waiting)
             before = self._paths[node.parent]
             moves = _moves(before[-1], node)
