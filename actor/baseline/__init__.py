@@ -1,1 +1,1 @@
-"""The scripted controller with true poses: what planning and control alone can reach."""
+"""The classical rivals: B0 with true poses, the ceiling of planning and control; B1 and B2 that sense."""

@@ -128,7 +128,7 @@ class Legs:
 
         def slopes(values: Array) -> Array:  # all at once, which is quicker than one after the other
             at = residuals(values + np.vstack([np.zeros(3), STEP * np.eye(3)]))
-            return (at[1:] - at[0]).T / STEP
+            return np.asarray((at[1:] - at[0]).T / STEP)
 
         found = least_squares(
             lambda values: residuals(values[None])[0],

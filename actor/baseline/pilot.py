@@ -15,9 +15,10 @@ from actor.baseline.detection import DollyFinder
 from actor.baseline.docking import apart
 from actor.baseline.occupancy import Occupancy, outside
 from actor.baseline.odometry import Odometry
-from actor.baseline.planning import FreeSpace, plan, plan_to
+from actor.baseline.planning import plan, plan_to
 from actor.baseline.scans import Scan, Scanner
 from actor.baseline.searching import Coverage, ring
+from actor.baseline.space import FreeSpace
 from actor.baseline.tracking import Tracker, is_still
 from common.geometry import SE2, Rectangle
 from common.world_config import WorldConfig

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from actor.baseline.planning import Raster
 from actor.baseline.scans import Scan
+from actor.baseline.space import Raster
 from common.geometry import SE2, Rectangle, as_rows
 from common.world_config import WorldConfig
 
