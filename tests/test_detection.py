@@ -93,6 +93,15 @@ def test_it_is_sure_when_it_has_come_near():
     assert away < 0.008 and turn < math.radians(0.5)
 
 
+def test_an_estimate_that_rests_on_two_legs_yields_to_a_better_one():
+    watcher, dolly = Watcher(), SE2(0.0, 4.0)
+    watcher.watch(dolly, SE2(0.0, 1.0, -0.2), count=1)
+    watcher.finder.dolly = dolly @ SE2(0.0, 1.19)  # its near legs are the true one's far legs
+    watcher.watch(dolly, SE2(0.0, 1.0, -0.2), SE2(0.0, 0.06, 0.03), count=12)
+    assert watcher.finder.dolly is not None
+    assert error(watcher.finder.dolly, dolly)[0] < 0.02
+
+
 def test_a_room_without_dolly_has_none():
     watcher = Watcher()
     watcher.watch(SE2(0.0, 200.0), SE2(0.0, 2.0, -1.0), count=50)

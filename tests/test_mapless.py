@@ -58,6 +58,19 @@ def test_with_a_map_it_does_too(start):
     assert drive(Pilot(WORLD, known), start)[0] == "docked"
 
 
+@pytest.mark.parametrize("yaw", [math.pi / 2, -math.pi / 2])
+def test_it_comes_away_from_a_wall_beside_it(yaw):
+    assert drive(Pilot(WORLD, NoMap()), SE2(0.5, -2.0, yaw))[0] == "docked"  # 0.185 m from the wall
+
+
+def test_a_wrong_map_does_not_keep_it_from_its_way():
+    class Wrong(NoMap):
+        def solids(self):
+            return [Rectangle(SE2(0.4, 0.0), 0.02, 3.0), Rectangle(SE2(-0.4, 0.0), 0.02, 3.0)]
+
+    assert drive(Pilot(WORLD, Wrong()), SE2(0.0, 1.0, -math.pi / 2))[0] == "docked"
+
+
 def test_it_goes_round_what_stands_in_its_way():
     crate = Rectangle(SE2(0.0, 2.2), 0.6, 0.2)
     end, poses = drive(Pilot(WORLD, NoMap()), SE2(0.0, 0.0), extra=[crate])

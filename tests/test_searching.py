@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from actor.baseline.occupancy import Occupancy, outside
-from actor.baseline.planning import FreeSpace, plan_to
+from actor.baseline.planning import plan_to
 from actor.baseline.scans import Scanner
 from actor.baseline.searching import Coverage, ring
+from actor.baseline.space import FreeSpace
 from common.cells import ROOMS
 from common.geometry import SE2, Rectangle, distance_to_rectangle
 from tests.flatland import WORLD, cast, legs
@@ -47,6 +48,20 @@ def test_what_is_cleared_is_gone_and_news_again():
     assert any(distance_to_rectangle(b.pose.x, b.pose.y, SCREEN) < 0.05 for b in occupancy.news())
     occupancy.add(Scanner(WORLD).read(SE2(), cast(SE2(), [*WALLS, SCREEN])))
     assert occupancy.news() == []
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wall_beside_the_robot_goes_on_where_no_beam_reaches(side):
+    pose, scanner = SE2(0.0, 3.0, 0.0), Scanner(WORLD)
+    wall = Rectangle(SE2(side * 0.6, 3.0), 0.1, 3.0)
+    scan = scanner.read(pose, cast(pose, [*WALLS, wall]))
+    points = scanner.bridges(scan)
+    assert np.abs(points[:, 0] - side * 0.5).max() < 0.01
+    corner = 3.0 + side * 0.55  # the front right one and the rear left one turn towards it unseen
+    assert np.abs(points[:, 1] - corner).min() < 0.1
+    seen = scan.points[scan.hits & (np.abs(scan.points[:, 0] - side * 0.5) < 0.01)]
+    assert np.abs(seen[:, 1] - corner).min() > 0.1
+    assert len(scanner.bridges(scanner.read(pose, cast(pose, [])))) == 0
 
 
 def test_posts_are_alone_and_walls_are_not():

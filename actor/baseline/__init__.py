@@ -1,1 +1,1 @@
-"""Classical controllers, examined like policies (section 4.4)."""
+"""The classical rivals: B0 with true poses, the ceiling of planning and control; B1 and B2 that sense."""

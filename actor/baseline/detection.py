@@ -33,8 +33,10 @@ COARSE, MIDDLE, FINE = 0.05, 0.03, 0.015
 """Tolerances of a hypothesis, of an estimate against new scans, and of a refined one, m."""
 BEAMS = 2500
 """Most beams that judge hypotheses."""
-RECENT = 4
-"""Scans that can contradict an estimate."""
+RECENT = 1, 4
+"""Scans that can contradict an estimate: one when near, some when few beams meet a leg."""
+BETTER = 3.0
+"""By so much a hypothesis has to score higher than an unsure estimate: less than one leg."""
 PALE = 2
 """Frames by which those that show no blue may outnumber the others."""
 TRACKED = 30
@@ -53,6 +55,7 @@ class DollyFinder:
         """The estimate; None while there is none."""
         self.place: tuple[float, float] | None = None
         """Roughly where the camera saw it last, m."""
+        self._age = 0
         self.is_sure = False
         """Whether the estimate is good enough to drive under the dolly."""
 
@@ -65,28 +68,34 @@ class DollyFinder:
             self.place = sighting.place
         if self.dolly is not None:
             self._track(self.dolly)
-        if self.dolly is None:
+        if self.dolly is None or (not self.is_sure and self._age % 3 == 0):
             self._find()
 
     def _track(self, dolly: SE2) -> None:
         """Refines the estimate, or gives it up when the newest scans contradict it."""
-        near = self.legs.near(self._scans.latest(TRACKED), dolly.x, dolly.y)
-        refined = self.legs.refine(dolly, near, gate=0.04)
-        recent = self.legs.near(self._scans.latest(RECENT), refined.x, refined.y)
-        fit = self.legs.fit(_row(refined), recent, MIDDLE)
-        if fit.against[0] >= 3 and fit.against[0] > fit.hits[0]:
-            self._lose(dolly)
-            self._sightings.clear()
-            return
+        self._age += 1
+        refined = dolly
+        is_due = not self.is_sure or self._age % 3 == 0
+        if is_due:
+            near = self.legs.near(self._scans.latest(TRACKED), dolly.x, dolly.y)
+            refined = self.legs.refine(dolly, near, gate=0.04)
+        for count in RECENT:
+            recent = self.legs.near(self._scans.latest(count), refined.x, refined.y)
+            fit = self.legs.fit(_row(refined), recent, MIDDLE)
+            if fit.against[0] >= 3 and fit.against[0] > fit.hits[0]:
+                self._lose(dolly)
+                self._sightings.clear()
+                return
         yes, no = self._sight.agrees(list(self._sightings), refined.x, refined.y)
         if no > yes + PALE:
             self._lose(dolly)
             return
         self.dolly = refined
-        whole = self.legs.fit(_row(refined), near, FINE)
-        self.is_sure = bool(
-            whole.legs[0] >= 3 and whole.hits[0] >= 10 and whole.against[0] <= 0.1 * whole.hits[0]
-        )
+        if is_due:
+            fit = self.legs.fit(_row(refined), near, FINE)
+            self.is_sure = bool(
+                fit.legs[0] >= 3 and fit.hits[0] >= 10 and fit.against[0] <= 0.1 * fit.hits[0]
+            )
 
     def _lose(self, dolly: SE2) -> None:
         """Forgets the dolly and what was seen of it: it has been moved, or never stood there."""
@@ -107,16 +116,19 @@ class DollyFinder:
         poses = poses[order]
         beams = self._about(scan, poses)
         coarse = self.legs.fit(poses, beams, COARSE)
-        best: tuple[float, SE2, Fit] | None = None
+        best, found = -math.inf, None
+        if self.dolly is not None:  # only what is clearly better replaces it
+            near = self.legs.near(scan, self.dolly.x, self.dolly.y)
+            best = BETTER + float(self.legs.fit(_row(self.dolly), near, FINE).score[0])
         for index in np.argsort(-coarse.score)[:4]:
             pose = SE2(*poses[index].tolist())
             near = self.legs.near(scan, pose.x, pose.y)
             pose = self.legs.refine(self.legs.refine(pose, near, gate=0.08), near, gate=0.04)
             fit = self.legs.fit(_row(pose), near, FINE)
-            if self._is_believable(pose, fit) and (best is None or fit.score[0] > best[0]):
-                best = float(fit.score[0]), pose, fit
-        if best is not None:
-            self.dolly, self.is_sure = best[1], False
+            if fit.score[0] > best and self._is_believable(pose, fit):
+                best, found = float(fit.score[0]), pose
+        if found is not None:
+            self.dolly, self.is_sure = found, False
 
     def _is_believable(self, pose: SE2, fit: Fit) -> bool:
         hits, legs, against = int(fit.hits[0]), int(fit.legs[0]), int(fit.against[0])

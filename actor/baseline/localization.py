@@ -29,7 +29,7 @@ DRIFT = 0.02, 0.01
 """Standard deviations added for each metre of motion (m) and each radian (rad): the drive is exact here."""
 JITTER = 0.005, 0.002
 """Standard deviations added when particles are drawn anew, m and rad."""
-MOVED = 0.05
+MOVED = 0.2
 """Between two weighings the robot moves by this, m and rad."""
 SHRUNK = 0.05
 """By this the map's rectangles are smaller on every side for the planner, m."""

@@ -15,9 +15,10 @@ from actor.baseline.detection import DollyFinder
 from actor.baseline.docking import apart
 from actor.baseline.occupancy import Occupancy, outside
 from actor.baseline.odometry import Odometry
-from actor.baseline.planning import FreeSpace, plan, plan_to
+from actor.baseline.planning import plan, plan_to
 from actor.baseline.scans import Scan, Scanner
 from actor.baseline.searching import Coverage, ring
+from actor.baseline.space import FreeSpace
 from actor.baseline.tracking import Tracker, is_still
 from common.geometry import SE2, Rectangle
 from common.world_config import WorldConfig
@@ -37,7 +38,7 @@ SETTLED = 0.004, math.radians(0.4)
 DRIFT = 0.03, 0.03
 """A robot that drives does when it has moved by the first (m) and this for each metre to the dolly."""
 PATIENCE = 12
-"""Steps that the last drive is put off for a better estimate."""
+"""Steps of an episode in which the last drive is put off for a better estimate."""
 RETRY = 6
 """Steps until a search for a way that failed is repeated: failing takes long."""
 WIGGLE = 0.4
@@ -112,7 +113,7 @@ class Pilot:
 
     def _dock(self, dolly: SE2) -> tuple[float, float]:
         pose, speeds, tracker = self._odometry.pose, self._odometry.speeds, self._tracker
-        if self._is_entering:
+        if self._is_entering and self._target is not None:
             end = dolly @ self._end  # the last drive follows the estimate
             tracker.path = [SE2(tracker.path[0].x, tracker.path[0].y, end.yaw), end]
             self._target = dolly
@@ -123,8 +124,7 @@ class Pilot:
             if not is_still(speeds):
                 return tracker.steered(0.0, 0.0, speeds)
             self._is_entering = False
-            solids = outside(self._solids(), dolly, *self._own())
-            tracker.path = plan(pose, dolly, solids, self._world)
+            tracker.path = self._way_in(dolly)
             self._target = dolly if tracker.path else None
             self._occupancy.news()
             if not tracker.path:
@@ -141,6 +141,13 @@ class Pilot:
             self._is_entering = True
         return tracker.command(pose, speeds)
 
+    def _way_in(self, dolly: SE2) -> list[SE2]:
+        for known in self._maps():
+            solids = known + outside(self._occupancy.boxes(), dolly, *self._own())
+            if path := plan(self._odometry.pose, dolly, solids, self._world):
+                return path
+        return []
+
     def _must_plan(self, dolly: SE2) -> bool:
         pose, tracker = self._odometry.pose, self._tracker
         if self._target is None or len(tracker.path) < 2 or tracker.is_off(pose):
@@ -150,15 +157,19 @@ class Pilot:
         else:
             limit = DRIFT[0] + DRIFT[1] * math.hypot(dolly.x - pose.x, dolly.y - pose.y)
             limits = limit, limit
-        return apart(self._target, dolly, *limits) or self._is_blocked(dolly)
+        if self._is_blocked(dolly):
+            self._target = None  # news comes once, stopping takes longer
+        return self._target is None or apart(self._target, dolly, *limits)
 
     def _own(self) -> tuple[float, float]:
         """Half extents (m) of the rectangle about the dolly in which returns are its own."""
         dolly = self._world.dolly
         return dolly.width / 2 + BESIDE, dolly.length / 2 + BESIDE
 
-    def _solids(self) -> list[Rectangle]:
-        return self._map.solids() + self._occupancy.boxes()
+    def _maps(self) -> list[list[Rectangle]]:
+        """What is planned with besides the returns: the map, then nothing, as it may lie a little wrong."""
+        known = self._map.solids()
+        return [known, []] if known else [[]]
 
     def _is_blocked(self, dolly: SE2 | None) -> bool:
         """Whether new returns stand in the way of the path."""
@@ -207,25 +218,25 @@ class Pilot:
         return tracker.command(pose, speeds)
 
     def _way_to_view(self, place: tuple[float, float] | None) -> list[SE2]:
-        pose, solids = self._odometry.pose, self._solids()
+        pose, boxes = self._odometry.pose, self._occupancy.boxes()
         if place is not None:
-            goals = ring(*place, VIEWS, 12)
-            solids = [*solids, Rectangle(SE2(*place), 0.5, 0.5)]  # its rails are out of sight
-        else:
-            goals = self._coverage.viewpoints(pose, solids)
-        goals = [
-            goal
-            for goal in goals
-            if all(math.hypot(goal.x - old.x, goal.y - old.y) > REVISIT for old in self._looked)
-        ]
-        path = plan_to(pose, goals, solids, self._world)
-        if not path and place is not None:
-            self.finder.place = None
-        return path
+            boxes.append(Rectangle(SE2(*place), 0.5, 0.5))  # its rails are out of sight
+        for known in self._maps():
+            solids = known + boxes
+            views = ring(*place, VIEWS, 12) if place else self._coverage.viewpoints(pose, solids)
+            goals = [view for view in views if not self._has_looked_from(view)]
+            if path := plan_to(pose, goals, solids, self._world):
+                return path
+        self.finder.place = None
+        return []
+
+    def _has_looked_from(self, view: SE2) -> bool:
+        return any(math.hypot(view.x - old.x, view.y - old.y) < REVISIT for old in self._looked)
 
     def _can_spin(self) -> bool:
         pose = self._odometry.pose
-        space = FreeSpace(self._solids(), self.finder.dolly, pose, self._world, NEWS_MARGIN)
+        solids = self._map.solids() + self._occupancy.boxes()
+        space = FreeSpace(solids, self.finder.dolly, pose, self._world, NEWS_MARGIN)
         ahead = -1.0 if self._clockwise else 1.0
         return space.can_turn(pose, pose.yaw + ahead)
 

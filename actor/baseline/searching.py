@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from actor.baseline.planning import Raster
 from actor.baseline.scans import Scan
+from actor.baseline.space import Raster
 from common.geometry import SE2, Rectangle, as_rows
 from common.world_config import WorldConfig
 
@@ -63,8 +63,9 @@ class Coverage:
         steps = np.arange(-STRIDE, STRIDE + LATTICE / 2, LATTICE)
         here = np.array([[pose.x, pose.y]])
         spots = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + here
-        raster = Raster(as_rows(solids), here)
-        spots = spots[(raster.gaps(spots) > ROOM) & raster.covers(spots)]
+        raster = Raster(as_rows(solids), spots)
+        in_sight = raster.are_open(here, spots, OPEN)  # so on this side of the walls
+        spots = spots[(raster.gaps(spots) > ROOM) & in_sight]
         hidden = self._places[~self.seen & raster.covers(self._places)]
         share = np.linspace(0.0, 1.0, 25)[:, None, None]
         offers = []

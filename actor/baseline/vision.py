@@ -18,6 +18,8 @@ DARKEST = 24
 """Below this level of blue (of 255) the camera's noise decides the hue."""
 FEWEST = 0.0005
 """Share of the image's pixels that must be blue before they count: 3 of 80 x 80."""
+FARTHEST = 5.0
+"""A dolly that seems farther, as one half in view may, is looked for at this distance first, m."""
 BEHIND_EDGE = 0.55
 """From the dolly's nearest edge to its centre, m, whatever its yaw: 0.41 to 0.74."""
 
@@ -52,7 +54,7 @@ class Sight:
         top = float(self._offsets[np.flatnonzero(rows)[0]])
         # the deck's nearest upper edge is its highest in the image, as the camera looks up at it
         depth = self.focal * self._rise / max(top, 0.5)
-        depth = min(depth, 9.0)
+        depth = min(depth, FARTHEST)
         side = -float(left + right) / 2 / self.focal
         away = (depth + BEHIND_EDGE / math.hypot(1.0, side)) if depth > 0 else 0.0
         return Sighting(camera, columns, camera.apply(side * away, away))
