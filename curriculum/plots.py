@@ -22,6 +22,7 @@ from common.messages import Category
 from curriculum.algorithms.base import State
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.calibration import brier_score, reliability
+from curriculum.curriculum import FORMAT
 from curriculum.database import SCHEMA
 from curriculum.task_space import make_space
 
@@ -267,9 +268,11 @@ def proposed(history: History, name: str, stage: slice) -> Floats:
 
 def predict(history: History, network: Network) -> NavaclQ:
     """f_pi as it was then; raises LeftOutError when there is none or config.toml is another's."""
-    algorithm, inputs, hidden, scales, *_ = network.values["kind"]
+    algorithm, inputs, hidden, scales, *saved_by = network.values["kind"]
     if not algorithm.startswith("navacl"):
         raise LeftOutError(f"{algorithm} has no f_pi")
+    if saved_by != [FORMAT]:
+        raise LeftOutError(f"f_pi after {network.outcomes} outcomes was saved by another version of navaclq")
     values = network.values["algorithm"]
     corrected = len(values["calibration"][2])
     settings = history.config.curriculum.model_copy(

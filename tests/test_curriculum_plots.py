@@ -479,3 +479,11 @@ def test_a_network_that_does_not_fit_is_left_out(box):
     network = history.networks[0]._replace(tensors=history.networks[0].tensors[:-40])
     with pytest.raises(LeftOutError, match="after 200 outcomes cannot be read"):
         surface(history, network)
+
+
+def test_a_network_of_another_version_is_left_out_with_that_word(box):
+    history = read(box.folder)
+    network = history.networks[0]
+    older = network._replace(values={**network.values, "kind": network.values["kind"][:4]})
+    with pytest.raises(LeftOutError, match="after 200 outcomes was saved by another version of navaclq"):
+        surface(history, older)
