@@ -158,9 +158,9 @@ def trajectories(
 
 
 def pictured(tasks: Sequence[Task]) -> list[int]:
-    """Numbers of the starts of which trajectories are drawn, spread over the list."""
-    count = min(PICTURED, len(tasks))
-    return [int(i) for i in np.linspace(0, len(tasks) - 1, 2 * count + 1)[1::2]]
+    """Numbers of the starts of which trajectories are drawn, always the same ones of a list."""
+    drawn = np.random.default_rng(0).choice(len(tasks), min(PICTURED, len(tasks)), replace=False)
+    return [int(number) for number in sorted(drawn)]
 
 
 def _draw_dolly(axes: Axes, dolly: SE2, config: DollyConfig, style: str = "-") -> None:
