@@ -7,6 +7,7 @@ did; B1 reads the room's index as well, for the map. Neither looks at the true p
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -30,7 +31,7 @@ START_PURPOSE = 3
 RoughStart = Callable[[Task, WorldConfig, np.random.Generator], SE2]
 
 
-class SensingActor:
+class SensingActor(ABC):
     """Drives the worlds of a rollout by what is sensed in them, one pilot for each episode."""
 
     def __init__(self, rollout: Rollout) -> None:
@@ -50,8 +51,9 @@ class SensingActor:
             actions[row] = pilot.act(sensed.frame, sensed.lidar, None if is_start else last)
         return actions
 
+    @abstractmethod
     def _map(self, slot: int) -> Map:
-        raise NotImplementedError
+        """What is known of the room of a slot."""
 
 
 class MaplessActor(SensingActor):
