@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -369,6 +370,12 @@ def test_networks_that_do_not_fit_their_configuration_are_refused(tmp_path):
     policy = Trained.read(save(SMOKE, tmp_path / "policy", networks(other)))
     with pytest.raises(UsageError, match="holds other networks than its configuration says"):
         examine(policy, suite("short").tasks[:1], 1)
+
+
+def test_networks_that_were_replaced_while_they_were_read_are_refused(tmp_path):
+    whole = Trained.read(save(SMOKE, tmp_path / "policy"))
+    with pytest.raises(UsageError, match="policy holds other networks than"):
+        examine(replace(whole, networks=whole.networks[:-40]), suite("short").tasks[:1], 1)
 
 
 def test_identity_is_that_of_the_content(tmp_path):

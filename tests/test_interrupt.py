@@ -83,16 +83,15 @@ def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
             env={**os.environ, MARK: mark, "HOME": str(folder)},
         )
     time.sleep(moment)
-    early = process.poll()
+    early, began = process.poll(), time.monotonic()
     if early is None:
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all that have not left its group
         time.sleep(0.5)
         if b"Exception ignored" in output.read_bytes():
             # the interpreter loses it in its own imports, before any of our lines runs; people press it again
             os.killpg(process.pid, signal.SIGINT)
-    began = time.monotonic()
     try:
-        process.wait(SOON * PATIENCE)
+        process.wait(began + SOON * PATIENCE - time.monotonic())
     except subprocess.TimeoutExpired:
         pytest.fail(
             f"{name} still runs {SOON * PATIENCE} s after Ctrl-C at {moment:.2f} s: {output.read_text()}"

@@ -59,7 +59,10 @@ class Trained:
     def read(cls, folder: Path) -> Trained:
         """Raises UsageError when `folder` is no policy, or a damaged one."""
         config, _ = load_policy(folder)
-        return cls(str(folder), config, (folder / NETWORKS).read_bytes())
+        try:
+            return cls(str(folder), config, (folder / NETWORKS).read_bytes())
+        except OSError as error:
+            raise UsageError(f"{folder / NETWORKS} cannot be read: {error.strerror}") from None
 
     @property
     def identity(self) -> str:
@@ -96,13 +99,13 @@ def load_driver(subject: Subject, terms: Terms, slots: int) -> tuple[Rollout, Ac
     if isinstance(subject, Rival):
         rollout = Rollout(config, Blind(config), slots, limit)
         return rollout, make_baseline(subject.name, rollout)
-    encoder, tensors = make_encoder(config), safetensors.torch.load(subject.networks)
-    actor = PolicyActor(config, slots, np.random.default_rng(0), terms.greedy)
+    encoder, actor = make_encoder(config), PolicyActor(config, slots, np.random.default_rng(0), terms.greedy)
     try:
+        tensors = safetensors.torch.load(subject.networks)
         if not config.encoder.end_to_end:
             load_state(tensors, encoder=encoder)
         actor.load(Version(counter=1), tensors)
-    except ValueError as error:
+    except (ValueError, safetensors.SafetensorError) as error:
         raise UsageError(
             f"{subject.name} holds other networks than its configuration says: {error}"
         ) from None
