@@ -48,12 +48,11 @@ def train(variant: str, folder: Path, minutes: float, seed: int) -> tuple[str, P
     return name, run
 
 
-def examine(run: Path) -> Curve:
-    """Summaries on suite `train` by environment steps, one for each snapshot."""
+def examine(run: Path, every: int) -> Curve:
+    """Summaries on suite `train` by environment steps, one for every so-many-th snapshot and the final one."""
     found = {}
-    for snapshot in sorted((run / "snapshots").iterdir()):
-        if not (snapshot.name.isdecimal() or snapshot.name == "final"):
-            continue
+    snapshots = sorted(path for path in (run / "snapshots").iterdir() if path.name.isdecimal())
+    for snapshot in [*snapshots[every - 1 :: every], run / "snapshots" / "final"]:
         kept = run / "evaluation" / f"{snapshot.name}.json"
         if not kept.exists():
             kept.parent.mkdir(exist_ok=True)
@@ -87,17 +86,18 @@ def main(
     folder: Annotated[Path, typer.Option(help="Where the runs are kept.")] = Path("runs"),
     minutes: Annotated[float, typer.Option(help="Minutes of each training.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of each training.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Examine every so-many-th snapshot.")] = 1,
 ) -> None:
     """Trains, examines and draws."""
-    curves = {name: examine(run) for name, run in [train(v, folder, minutes, seed) for v in variants]}
+    curves = {name: examine(run, every) for name, run in [train(v, folder, minutes, seed) for v in variants]}
     alone = len(curves) == 1
     figure, panels = plt.subplots(
         1, 1 + alone, figsize=(7 + 4 * alone, 4), layout="constrained", squeeze=False
     )
     for name, curve in curves.items():
         draw_success(panels[0, 0], name, curve)
-        steps, last = list(curve.items())[-1]
-        sys.stdout.write(f"{name}: {json.dumps({'env_steps': steps, **last})}\n")
+        for steps, found in curve.items():
+            sys.stdout.write(f"{name}: {json.dumps({'env_steps': steps, **found})}\n")
     panels[0, 0].set(xlabel="environment steps", ylabel="success on suite train, %", ylim=(0, 100))
     panels[0, 0].set_title(
         f"{minutes:g} minutes, seed {seed}; bands: 95% intervals of 400 tasks", fontsize=10
