@@ -49,7 +49,7 @@ def train(variant: str, folder: Path, minutes: float, seed: int) -> tuple[str, P
 
 
 def examine(run: Path, every: int) -> Curve:
-    """Summaries on suite `train` by environment steps, one for every so-many-th snapshot and the final one."""
+    """Summaries on suite `train` by environment steps, one for every so-many-th snapshot and the last."""
     found = {}
     snapshots = sorted(path for path in (run / "snapshots").iterdir() if path.name.isdecimal())
     for snapshot in [*snapshots[every - 1 :: every], run / "snapshots" / "final"]:

@@ -401,5 +401,5 @@ class DuplicateFilter:
         """Takes over what another filter had seen, in place of what is known of the same incarnations."""
         for actor, boot, high, gaps in state:
             key = str(actor), str(boot)
+            self._gaps[key] = set(gaps)  # type: ignore[call-overload]  # first, for who asks beside
             self._next[key] = int(high)  # type: ignore[call-overload]
-            self._gaps[key] = set(gaps)  # type: ignore[call-overload]

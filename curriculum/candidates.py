@@ -130,9 +130,11 @@ class Cell:
         self.table.lease[self._slot(row)] = until
 
     def stale(self, version: Version) -> NDArray[np.int64]:
-        """Rows of those whose Q is not of these weights."""
+        """(N, 3), version and row of those whose Q is not of these weights, the oldest version first."""
         wanted = (version.epoch, version.counter)
-        return np.asarray(self.table.row[(self.table.version != wanted).any(axis=1)])
+        stale = (self.table.version != wanted).any(axis=1)
+        found = np.column_stack([self.table.version[stale], self.table.row[stale]])
+        return found[np.lexsort(found.T[::-1])]
 
     def unread(self, rows: Sequence[int]) -> list[int]:
         """Those that are there without their start observation at hand."""

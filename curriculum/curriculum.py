@@ -84,13 +84,14 @@ class Report(NamedTuple):
 
 
 class Curriculum:
-    """What a database holds, and what to propose from it; `encoder` is that of the candidates in it.
+    """What a database holds, and what to propose from it.
 
+    Candidates of another `encoder` than the run's are dropped; None takes them as they are, standing alone.
     What changes it is in the database before it is learned: after an OSError nothing has happened. One thread
     at a time.
     """
 
-    def __init__(self, config: Config, database: Database | None = None, encoder: str = "") -> None:
+    def __init__(self, config: Config, database: Database | None = None, encoder: str | None = None) -> None:
         self.config, self.encoder = config, encoder
         self.database = database or Database(None)
         self.space = make_space(config)
@@ -99,8 +100,9 @@ class Curriculum:
         self.version: Version | None = None
         """Of the weights that Q is computed by; None before the first."""
         self._load()
-        with suppress(OSError), self._writing():
-            self.database.drop_candidates_but(encoder)
+        if encoder is not None:
+            with suppress(OSError), self._writing():
+                self.database.drop_candidates_but(encoder)
 
     def _load(self) -> None:
         """Everything from the database: a saved state, and what came after it."""
@@ -144,7 +146,8 @@ class Curriculum:
         """What a saved state must agree with."""
         settings = self.config.curriculum
         scales = [list(scale) for scale in self.space.scales.values()]
-        return [settings.algorithm, list(self.space.inputs), list(settings.hidden), scales, FORMAT]
+        inputs, hidden = list(self.space.inputs), list(settings.hidden)
+        return [settings.algorithm, inputs, hidden, scales, FORMAT, settings.reservoir]
 
     def _load_state(self) -> int:
         """Takes a saved state; returns the number of the last outcome in it."""
@@ -255,8 +258,9 @@ class Curriculum:
         )
 
     def knows(self, outcome: Outcome) -> bool:
-        """Whether it is of a task that was proposed here, and has not been reported."""
-        return outcome.proposal is not None and self.database.has_lease(outcome.proposal)
+        """Whether what was proposed is on record, so that what it says of the task does not matter."""
+        name, database = outcome.proposal, self.database
+        return name is not None and (database.has_lease(name) or database.has_outcome(name))
 
     def entry(self, task: AnyTask) -> Entry:
         """A task with its geometry, a millisecond; MessageError for an impossible one. Touches nothing."""
@@ -267,28 +271,29 @@ class Curriculum:
 
     def report(self, reports: Iterable[Report]) -> None:
         """Takes how tasks ended, all or none, once for each proposal; MessageError for an impossible task."""
-        ended: list[tuple[int | None, Result, bool]] = []
+        ended: list[tuple[int | None, Result]] = []
         heard, senders = DuplicateFilter(), set[tuple[str, str]]()
         with self._writing():
             for outcome, origin, entry in reports:
+                sender = origin.actor, origin.boot
+                heard.restore([(heard if sender in senders else self.seen).after(origin)])
+                senders.add(sender)
+                if outcome.proposal and self.database.has_outcome(outcome.proposal):
+                    continue
                 lease = self.database.end_lease(outcome.proposal) if outcome.proposal else None
                 if lease is None:
                     lease = Lease(None, None, "unserved", entry or self.entry(outcome.task), None)
                 result = Result(lease.entry, lease.category, lease.f, outcome.success)
                 if lease.candidate is not None:
                     self.database.drop_candidate(lease.candidate)
-                is_new = self.database.add_outcome(outcome.proposal, origin.actor, result, lease.requested)
-                ended.append((lease.candidate, result, is_new))
-                sender = origin.actor, origin.boot
-                heard.restore([(heard if sender in senders else self.seen).after(origin)])
-                senders.add(sender)
+                self.database.add_outcome(outcome.proposal, origin.actor, result, lease.requested)
+                ended.append((lease.candidate, result))
             self.database.keep_origins(heard)
         self.seen.restore(heard.state())
-        for candidate, result, is_new in ended:
+        for candidate, result in ended:
             if candidate is not None:
                 self.cells[result.entry.cell].drop(candidate)
-            if is_new:
-                self._learn(result)
+            self._learn(result)
 
     def _learn(self, result: Result) -> None:
         self.outcomes += 1
@@ -318,7 +323,7 @@ class Curriculum:
         heard.restore([self.seen.after(origin)])
         with self._writing():
             for entry in entries:
-                self.database.add_candidate(entry, self.encoder)
+                self.database.add_candidate(entry, self.encoder or "")
                 new[entry.cell].append(entry)
             for cell, added in new.items():
                 held = [*self.cells[cell].table.row.tolist(), *(entry.row for entry in added)]
@@ -342,11 +347,13 @@ class Curriculum:
         self.version = version
 
     def stale(self, size: int) -> list[tuple[Cell, list[int]]]:
-        """Candidates whose Q could be newer, rows of a cell, so many together at most."""
+        """Candidates whose Q could be newer, rows of a cell, so many together at most; the oldest Q first."""
         if self.version is None:
             return []
-        found = [(cell, cell.stale(self.version).tolist()) for cell in self.cells]
-        return [(cell, rows[i : i + size]) for cell, rows in found for i in range(0, len(rows), size)]
+        found = [(cell, cell.stale(self.version)) for cell in self.cells]
+        batches = [(cell, stale[i : i + size]) for cell, stale in found for i in range(0, len(stale), size)]
+        batches.sort(key=lambda batch: batch[1][0].tolist())
+        return [(cell, stale[:, -1].tolist()) for cell, stale in batches]
 
     def refresh(self, cell: Cell, rows: list[int], alone: AbstractContextManager[object]) -> None:
         """Renews Q of candidates that are still there; beside other threads but for what is done `alone`."""

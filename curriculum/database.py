@@ -101,11 +101,16 @@ class Database:
         except sqlite3.OperationalError as error:
             raise OSError(f"{self.name}: {error}") from None
 
-    def checkpoint(self) -> None:
-        """Moves what was committed from the write-ahead log to its place; may run beside other threads."""
+    def checkpoint(self) -> int:
+        """Moves what was committed from the write-ahead log to its place; may run beside other threads.
+
+        Returns the pages in the log, which begins again only if nothing was committed meanwhile.
+        """
+        pages = 0
         if self._file is not None:
             with suppress(sqlite3.OperationalError), closing(sqlite3.connect(self._file)) as own:
-                own.execute("PRAGMA wal_checkpoint(PASSIVE)")
+                _, pages, _ = own.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+        return pages
 
     def roll_back(self) -> None:
         """Forgets everything since the last commit."""
@@ -129,9 +134,9 @@ class Database:
         """Takes one out."""
         self._do("DELETE FROM candidates WHERE id = ?", (row,))
 
-    def candidates(self, encoder: str) -> list[tuple[int, str]]:
-        """(row, text of the Entry) of those of one encoder, oldest first."""
-        query = "SELECT id, entry FROM candidates WHERE encoder = ? ORDER BY id"
+    def candidates(self, encoder: str | None) -> list[tuple[int, str]]:
+        """(row, text of the Entry) of those of one encoder, None: of any; oldest first."""
+        query = "SELECT id, entry FROM candidates WHERE encoder = coalesce(?, encoder) ORDER BY id"
         return self._sql.execute(query, (encoder,)).fetchall()
 
     def observed(self, rows: Iterable[int]) -> list[tuple[int, bytes]]:
@@ -191,13 +196,18 @@ class Database:
         entry.q = q
         return Lease(candidate, requested, category, entry, f)
 
+    def has_outcome(self, proposal: str) -> bool:
+        """Whether it is known how this proposal ended."""
+        query = "SELECT 1 FROM outcomes WHERE proposal = ?"
+        return self._sql.execute(query, (proposal,)).fetchone() is not None
+
     def add_outcome(
         self, proposal: str | None, actor: str, result: Result, requested: Requested | None = None
-    ) -> bool:
-        """Keeps an outcome; False when that of this proposal is known."""
+    ) -> None:
+        """Keeps an outcome, of a proposal the first."""
         entry = result.entry
-        found = self._do(
-            "INSERT OR IGNORE INTO outcomes (proposal, at, actor, requested, category, entry, q, f, success) "
+        self._do(
+            "INSERT INTO outcomes (proposal, at, actor, requested, category, entry, q, f, success) "
             "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
                 proposal,
@@ -211,7 +221,6 @@ class Database:
                 int(result.success),
             ),
         )
-        return found.rowcount == 1
 
     def outcomes(self, after: int = 0) -> Iterator[Outcome]:
         """Those on record, oldest first."""

@@ -271,7 +271,7 @@ def predict(history: History, network: Network) -> NavaclQ:
     algorithm, inputs, hidden, scales, *saved_by = network.values["kind"]
     if not algorithm.startswith("navacl"):
         raise LeftOutError(f"{algorithm} has no f_pi")
-    if saved_by != [FORMAT]:
+    if saved_by[:1] != [FORMAT]:
         raise LeftOutError(f"f_pi after {network.outcomes} outcomes was saved by another version of navaclq")
     values = network.values["algorithm"]
     corrected = len(values["calibration"][2])

@@ -45,6 +45,8 @@ CRITIC_REST_SECONDS = 6.0
 """Between two pulls of the critic: 3 MB each, and Q(s0, a0) changes slowly."""
 TICK = 0.2
 """Seconds between two looks around."""
+LOG_PAGES = 4096
+"""Of 4 kB in the database's write-ahead log, from which on it is made to begin again."""
 Q_SECONDS, Q_BATCH = 0.03, 64
 """Of a tick at most for Q of candidates, and how many are computed together."""
 REPORTS = 16
@@ -71,7 +73,7 @@ class CurriculumService:
         sys.setswitchinterval(SWITCH_SECONDS)
         sync = config.learner.durability == "host"
         database = Database(folder / DATABASE if folder else None, sync)
-        self.curriculum = Curriculum(config, database, (digest or {}).get("encoder", ""))
+        self.curriculum = Curriculum(config, database, digest.get("encoder") if digest else None)
         self._digest = digest
         self._failed_writes, self._failed_at, self._closed = 0, 0.0, False
         self._arrived: dict[Origin, Report] = {}
@@ -104,7 +106,9 @@ class CurriculumService:
             if time.monotonic() - saved >= SAVE_SECONDS:
                 saved = time.monotonic()
                 self.save()
-                self.curriculum.database.checkpoint()
+                if self.curriculum.database.checkpoint() > LOG_PAGES:
+                    with self._lock:  # the little that came meanwhile
+                        self.curriculum.database.checkpoint()
 
     def _refresh_q(self) -> None:
         """Takes newer weights, and values candidates by them, a while at a time."""
@@ -154,8 +158,11 @@ class CurriculumService:
         self.curriculum.database.close()
 
     def _propose(self, query: TaskQuery) -> Message:
-        with self._lock:
-            return Proposals(tasks=[self.curriculum.propose(query.cell, query.t) for _ in range(query.count)])
+        tasks = []
+        for _ in range(query.count):
+            with self._lock:
+                tasks.append(self.curriculum.propose(query.cell, query.t))
+        return Proposals(tasks=tasks)
 
     def _score(self, query: ScoreQuery) -> Message:
         properties = self.curriculum.properties(query)

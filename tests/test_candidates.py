@@ -140,8 +140,10 @@ def test_stale_are_those_whose_q_is_missing_or_of_other_weights():
     cell = filled(4)
     value(cell, {2: 0.0, 3: 0.0}, (1, 7))
     value(cell, {4: 0.0}, (1, 8))
-    assert cell.stale(Version(epoch=1, counter=7)).tolist() == [1, 4]
-    assert cell.stale(Version(epoch=2, counter=7)).tolist() == [1, 2, 3, 4]
+    assert cell.stale(Version(epoch=1, counter=7)).tolist() == [[-1, -1, 1], [1, 8, 4]]
+    assert cell.stale(Version(epoch=2, counter=7))[:, -1].tolist() == [1, 2, 3, 4]
+    value(cell, {1: 0.0}, (2, 6))
+    assert cell.stale(Version(epoch=2, counter=7))[:, -1].tolist() == [2, 3, 4, 1], "the oldest first"
 
 
 def test_start_observations_are_kept_of_those_that_are_there():

@@ -601,6 +601,15 @@ def test_state_of_another_algorithm_is_learned_again_from_the_outcomes_on_record
     assert (rnd.outcomes, rnd.propose(0, 0).category) == (40, "rnd")
 
 
+def test_another_reservoir_is_filled_from_the_outcomes_on_record(file):
+    saved = played(PLUS, file, outcomes=40, successes=15)
+    saved.save()
+    saved.database.close()
+    settings = PLUS.curriculum.model_copy(update={"reservoir": 20})
+    smaller = Curriculum(PLUS.model_copy(update={"curriculum": settings}), Database(file))
+    assert (smaller.outcomes, network_of(smaller).fits) == (40, 2)
+
+
 @pytest.mark.parametrize("damage", ["{", "{}", "[]", "3", "null", '{"numbers": 3}'])
 def test_damaged_state_is_a_usage_error(file, damage):
     saved = played(FEW, file, outcomes=1, successes=1)

@@ -248,7 +248,17 @@ def test_curriculum_goes_by_its_own_record_of_a_proposal(client, started):
     assert outcome.result.entry.task == proposal.task
 
 
-def test_a_lease_that_ran_out_counts_as_proposed_until_a_restart(client, started, tmp_path):
+def test_a_second_outcome_of_a_proposal_is_acknowledged_whatever_it_says_of_the_task(client, started):
+    service = started()
+    (proposal,) = query(client)
+    dummy = Outcome(proposal=proposal.id, task=TASK | {"gap": 99.0}, success=False)
+    told = deliver_all(client, KEYS.result, [parcel(dummy, seq) for seq in range(2)])
+    assert told.answers == ["", ""]
+    assert deliver(client, KEYS.result, dummy, 2) == STORED
+    assert service.curriculum.outcomes == 1
+
+
+def test_a_lease_that_ran_out_counts_as_proposed_for_as_long_again(client, started, tmp_path):
     first = started("curriculum.lease=0.001", folder=tmp_path)
     proposals = query(client, count=2)
     wait_until(lambda: first.curriculum.database.count_leases() == 0, what="the end of the leases")

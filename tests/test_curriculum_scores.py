@@ -461,9 +461,9 @@ def asked(session: zenoh.Session, kind: type[M], question: Message, key: str) ->
 
 def test_killed_curriculum_has_every_acknowledged_outcome_once(processes, endpoint, tmp_path):
     keys, spool = Keys("run"), Spool(tmp_path / "spool", 2.0**20)
-    command = ("curriculum", "serve", "--run", tmp_path / "run", "--listen", endpoint, *SETTINGS)
+    command = ("curriculum", "serve", "--run", tmp_path / "run", "--listen", endpoint)
     reported: dict[str, bool] = {}
-    processes.start("life 0", *command)
+    processes.start("life 0", *command, *SETTINGS)  # which are kept
     with open_client(make_link(endpoint), patience=120) as session:
         sender = Sender(session, spool, Member("actor", "local", "a1"), "b1", timeout=2.0)
         for life in range(3):

@@ -17,6 +17,7 @@ from rich.table import Table
 from common.bus import Keys, ask
 from common.cells import check_cell
 from common.errors import UsageError
+from common.files import write_atomically
 from common.link import Link, open_client, open_hub
 from common.messages import Nothing, Proposals, ScoreQuery, Scores, Snapshot, TaskQuery
 from common.resources import one_torch_thread
@@ -42,7 +43,10 @@ def serve_curriculum(
     connect: Annotated[str | None, typer.Option(help="Endpoint of a learner to join.")] = None,
     listen: Annotated[str | None, typer.Option(help="Endpoint to listen on, standing alone.")] = None,
     run: Annotated[
-        Path | None, typer.Option(help="Run directory; everything is kept in its curriculum.db.")
+        Path | None,
+        typer.Option(
+            help="Run directory; all is kept in its curriculum.db, standing alone also in config.toml."
+        ),
     ] = None,
     preset: options.Preset = None,
     variant: options.Variant = None,
@@ -80,6 +84,9 @@ def serve_curriculum(
         resolved = options.configuration(preset, variant, config, settings, seed)
         with open_hub(link) as session:
             name = run.resolve().name if run else "standalone"
+            if run and not (run / "run.json").exists():  # else it is a training's, which has its own
+                run.mkdir(parents=True, exist_ok=True)
+                write_atomically(run / "config.toml", resolved.to_toml().encode())
             _serve(CurriculumService(session, name, resolved, None, run, link.group), link)
 
 
