@@ -6,7 +6,7 @@ import logging
 import queue
 import time
 import uuid
-from collections import Counter
+from collections import Counter, deque
 from functools import partial
 from pathlib import Path
 
@@ -40,6 +40,8 @@ from common.weights import WeightsPuller
 
 log = logging.getLogger(__name__)
 CANDIDATE_BATCH = 40
+RANDOM_TASKS = 100
+"""Of the last ones it counts how many succeeded."""
 
 
 class ActorService:
@@ -77,6 +79,7 @@ class ActorService:
         self._answers: queue.SimpleQueue[tuple[int, float, bytes | Exception]] = queue.SimpleQueue()
         self._task_latency = Quantiles()
         self._candidates: list[Candidate] = []
+        self._random_successes: deque[bool] = deque(maxlen=RANDOM_TASKS)
         self._categories: Counter[str] = Counter()
         self._endings: Counter[str] = Counter()
         self._reporter = Reporter(session, self.keys, member)
@@ -163,6 +166,8 @@ class ActorService:
         self._agent_steps[slot] += len(finished.columns.reward) - 1
         self._endings[finished.ending] += 1
         category = proposal.category if proposal else "unserved"
+        if category == "random":
+            self._random_successes.append(finished.ending == "success")
         episode = finished.message(
             self.contract.digest, self._first_version[slot], self._actor.version(slot), category
         )
@@ -183,7 +188,9 @@ class ActorService:
         """Adds one more candidate start to the next batch for the curriculum's task database."""
         if not self.config.curriculum.uses_q:
             return
-        task: Task = candidate_task(self._cells[slot], self.config, self._rng)
+        fades = self.config.curriculum.narrowed_fades
+        solved = sum(self._random_successes) / RANDOM_TASKS if fades else 0.0
+        task: Task = candidate_task(self._cells[slot], self.config, self._rng, solved)
         self._candidates.append(self._rollout.look(slot, task))
         if len(self._candidates) >= CANDIDATE_BATCH:
             self._send_candidates()

@@ -288,6 +288,8 @@ class CurriculumConfig(Section):
     """Share of easy tasks among those that are not random; the authors' code has a half."""
     narrowed_candidates: Fraction = 0.75
     """Share of candidates drawn from ranges between the gate's and the full ones."""
+    narrowed_fades: bool = True
+    """That share goes down as random tasks succeed: times the share of an actor's last 100 that failed."""
     store_per_cell: Count = 1000
     lease: Positive = 600.0
     """Seconds after which a task that was handed out and not reported may be proposed again."""

@@ -291,6 +291,6 @@ def narrowed_task(cell: int, config: Config, rng: np.random.Generator, share: fl
     return task
 
 
-def candidate_task(cell: int, config: Config, rng: np.random.Generator) -> Task:
-    """A task for the curriculum's database."""
-    return narrowed_task(cell, config, rng, config.curriculum.narrowed_candidates)
+def candidate_task(cell: int, config: Config, rng: np.random.Generator, solved: float = 0.0) -> Task:
+    """A task for the curriculum's database; the more random tasks are `solved`, the fewer are narrowed."""
+    return narrowed_task(cell, config, rng, config.curriculum.narrowed_candidates * (1 - solved))

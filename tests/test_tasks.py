@@ -713,6 +713,8 @@ def test_share_of_narrowed_candidates_is_the_configured_one():
         tasks = [candidate_task(2, config, rng) for _ in range(400)]
         assert low <= sum(task.start != config.world.start for task in tasks) <= high
         assert all(Task.model_validate(task.model_dump()) == task for task in tasks)
+        tasks = [candidate_task(2, config, rng, solved=1.0) for _ in range(100)]
+        assert all(task.start == config.world.start for task in tasks)
 
 
 @st.composite
