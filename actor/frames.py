@@ -6,9 +6,9 @@ import logging
 import math
 import multiprocessing
 import os
-import signal
 import uuid
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +22,9 @@ from common.delivery import Sender, Spool, count_life
 from common.frames import Film
 from common.geometry import bearing, wrap
 from common.messages import ContractReply, Frames
+from common.signals import stop_on_signals, workers_start
 from common.tasks import FIRST_SUITE_SEED, Task, narrowed_task
-from common.telemetry import Rate, Reporter, stop_on_signals
+from common.telemetry import Rate, Reporter
 
 log = logging.getLogger(__name__)
 SPREAD = 0.6
@@ -87,7 +88,11 @@ def film_all(
     chunks = [tasks[i::FILM_CHUNKS] for i in range(FILM_CHUNKS)]
     films: list[Film | None] = [None] * len(tasks)
     done = 0
-    with multiprocessing.get_context("spawn").Pool(os.cpu_count(), _start_worker, (config,)) as pool:
+    with ExitStack() as stack:
+        with workers_start():
+            pool = stack.enter_context(
+                multiprocessing.get_context("spawn").Pool(os.cpu_count(), _start_worker, (config,))
+            )
         for index, found in enumerate(pool.imap(_film_chunk, chunks)):
             films[index::FILM_CHUNKS] = found
             done += len(found)
@@ -104,7 +109,6 @@ _world: DockingWorld | None = None
 
 def _start_worker(config: Config) -> None:
     global _world
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     _world = DockingWorld(config.world, config.world.max_episode_steps)
 
 

@@ -34,8 +34,9 @@ from common.messages import (
     decode,
     encode,
 )
+from common.signals import stop_on_signals
 from common.tasks import Task, candidate_task, random_task
-from common.telemetry import Quantiles, Rate, Reporter, stop_on_signals
+from common.telemetry import Quantiles, Rate, Reporter
 from common.weights import WeightsPuller
 
 log = logging.getLogger(__name__)

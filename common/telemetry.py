@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import socket
 import sys
-import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from types import FrameType
 
 import numpy as np
 import zenoh
@@ -86,51 +82,3 @@ def start_logging(level: int = logging.INFO) -> None:
     logging.basicConfig(
         level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
     )
-
-
-def stop_on_signals() -> threading.Event:
-    """From now on SIGTERM and SIGINT set the event: for a loop that is to end between two of its rounds."""
-    stopping = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopping.set())
-    return stopping
-
-
-def exit_on_signals() -> None:
-    """Turns SIGTERM and SIGINT into SystemExit, once, so that sessions and files are closed on leaving."""
-    leaving = False
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        nonlocal leaving
-        if not leaving:
-            leaving = True
-            raise SystemExit(0)
-
-    def stay() -> None:
-        nonlocal leaving
-        leaving = False
-
-    give_again(SystemExit, signal.SIGTERM, stay)
-    signal.signal(signal.SIGTERM, leave)
-    signal.signal(signal.SIGINT, leave)
-
-
-_again: dict[type[BaseException], tuple[int, Callable[[], None]]] = {}
-
-
-def give_again(error: type[BaseException], number: int, before: Callable[[], None] = lambda: None) -> None:
-    """Where Python ignores exceptions, in a callback of an import for example, a signal's is not lost.
-
-    The signal `number`, whose handler raised `error`, is given again a moment later.
-    """
-    _again[error] = number, before
-    sys.unraisablehook = _unraisable
-
-
-def _unraisable(what: sys.UnraisableHookArgs) -> None:
-    if what.exc_type not in _again:
-        sys.__unraisablehook__(what)
-        return
-    number, before = _again[what.exc_type]
-    before()
-    threading.Timer(0.05, os.kill, (os.getpid(), number)).start()

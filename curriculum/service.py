@@ -32,7 +32,8 @@ from common.messages import (
     Version,
     decode,
 )
-from common.telemetry import Reporter, stop_on_signals
+from common.signals import stop_on_signals
+from common.telemetry import Reporter
 from common.weights import WeightsPuller
 from curriculum.algorithms.navacl_q import NavaclQ
 from curriculum.curriculum import Curriculum, Report

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import RunError, UsageError
+from common.signals import signals_held
 
 STOP_SECONDS = 4.0
 LONGEST_BACK_OFF = 30.0
@@ -56,7 +57,7 @@ class Child:
     def start(self) -> None:
         """Starts the process in a group of its own, its output appended to the log file."""
         self.log_file.parent.mkdir(parents=True, exist_ok=True)
-        with self.log_file.open("ab") as output:
+        with self.log_file.open("ab") as output, signals_held():
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "deploy.cli", *self.command()],
                 stdin=subprocess.DEVNULL,

@@ -41,7 +41,8 @@ from common.messages import (
 from common.networks import state_of
 from common.observation import ObservationLayout
 from common.resources import check_memory, learner_threads
-from common.telemetry import Rate, Reporter, stop_on_signals
+from common.signals import stop_on_signals
+from common.telemetry import Rate, Reporter
 from common.weights import pack
 from common.world_config import StartRanges
 from learner.checkpoint import RunDirectory

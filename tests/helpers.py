@@ -33,6 +33,11 @@ def free_endpoint() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
 
 
+def heed_ctrl_c() -> None:
+    """Tests that run in the background of a script ignore it, and so would what they start."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def wait_until(condition: Callable[[], Any], timeout: float = 10.0, what: str = "the condition") -> Any:
     """The first true value of `condition`, polled every 5 ms; fails after `timeout` s of a quiet machine."""
     timeout *= PATIENCE

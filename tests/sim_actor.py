@@ -23,7 +23,8 @@ from common.delivery import Sender, Spool
 from common.errors import UsageError
 from common.link import end_process, make_link, open_client
 from common.messages import Candidate, Candidates, Episode, Outcome, TaskQuery, encode
-from common.telemetry import Reporter, exit_on_signals, start_logging, stop_on_signals
+from common.signals import exit_on_signals, stop_on_signals
+from common.telemetry import Reporter, start_logging
 from common.weights import WeightsPuller
 from tests.helpers import tiny_episode
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.crew import SMOKE
-from tests.helpers import PATIENCE, free_endpoint
+from tests.helpers import PATIENCE, free_endpoint, heed_ctrl_c
 
 SOON = 5.0
 """Seconds until everything has ended."""
@@ -61,11 +61,6 @@ def mark() -> Iterator[str]:
                 os.kill(int(folder.name), signal.SIGKILL)
         except OSError:
             continue
-
-
-def heed_ctrl_c() -> None:
-    """Tests that run in the background of a script ignore it, and so would what they start."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:

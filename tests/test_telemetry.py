@@ -2,10 +2,7 @@ import importlib.util
 import os
 import re
 import shutil
-import signal
 import socket
-import subprocess
-import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -18,70 +15,6 @@ from common.messages import PROTOCOL, Stat
 from common.telemetry import Quantiles, Reporter
 from common.version import PACKAGES, code_version
 from tests.helpers import wait_until
-
-SCRIPT = """
-import sys, time
-from common.link import make_link, open_hub
-from common.telemetry import exit_on_signals
-exit_on_signals()
-try:
-    with open_hub(make_link(sys.argv[1])):
-        print("up", flush=True)
-        while True:  # a signal just before a long sleep would not end it
-            time.sleep(0.05)
-finally:
-    print("closed", flush=True)
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_a_process_cleanly_with_its_session_closed(endpoint, number):
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, endpoint], stdout=subprocess.PIPE, cwd=Path(__file__).parents[1]
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"up\n"
-    process.send_signal(number)
-    rest, _ = process.communicate(timeout=20)
-    assert rest == b"closed\n"
-    assert process.returncode == 0
-
-
-IN_A_CALLBACK = """
-import signal, time, weakref
-from common.telemetry import exit_on_signals
-class Gone: pass
-exit_on_signals()
-gone = Gone()
-callback = weakref.ref(gone, lambda _: signal.raise_signal(signal.SIGINT))
-try:
-    del gone
-    print("ignored", flush=True)
-    for _ in range(600):
-        time.sleep(0.05)
-finally:
-    print("closed", flush=True)
-"""
-
-
-BEFORE = """
-from common.telemetry import give_again
-give_again(KeyboardInterrupt, signal.SIGINT)
-"""
-
-
-def test_a_signal_that_comes_where_python_ignores_exceptions_is_not_lost():
-    """As in an import's callbacks, for the first seconds of every command."""
-
-    def run(script):
-        command, folder = [sys.executable, "-c", script], Path(__file__).parents[1]
-        found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25)
-        return found.returncode, found.stdout, found.stderr
-
-    assert run(IN_A_CALLBACK) == (0, b"ignored\nclosed\n", b"")
-    code, out, err = run(IN_A_CALLBACK.replace("exit_on_signals()", BEFORE))
-    assert (code, out) == (-signal.SIGINT, b"ignored\nclosed\n")
-    assert err.endswith(b"KeyboardInterrupt\n")
 
 
 def test_figures_are_due_at_once_and_then_not_again_within_the_second(hub, client):

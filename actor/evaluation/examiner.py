@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -26,6 +25,7 @@ from common.files import content_hash
 from common.messages import Version
 from common.networks import load_state, make_encoder
 from common.policy_files import NETWORKS, load_policy
+from common.signals import workers_start
 from common.tasks import Task
 
 CHUNK = 22
@@ -155,7 +155,6 @@ Piece = tuple[int, Sequence[Task]]
 
 def _work(pipe: Connection, subject: Subject, terms: Terms) -> None:
     """A worker process: drives each piece that comes, until its parent has gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     try:
         examiner = Examiner(subject, terms)
         while True:
@@ -181,8 +180,9 @@ def _drive(
         for _ in range(min(processes, len(pieces))):
             ours, theirs = context.Pipe()
             worker = context.Process(target=_work, args=(theirs, subject, terms), daemon=True)
-            workers.append(worker)
-            worker.start()
+            with workers_start():
+                worker.start()
+                workers.append(worker)
             theirs.close()
             ours.send(waiting.pop())
             busy.append(ours)

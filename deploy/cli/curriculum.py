@@ -21,8 +21,9 @@ from common.files import write_atomically
 from common.link import Link, open_client, open_hub
 from common.messages import Nothing, Proposals, ScoreQuery, Scores, Snapshot, TaskQuery
 from common.resources import one_torch_thread
+from common.signals import exit_on_signals
 from common.tasks import Task
-from common.telemetry import exit_on_signals, start_logging
+from common.telemetry import start_logging
 from deploy.cli import options
 from deploy.cli.processes import say_waiting
 

@@ -11,7 +11,7 @@ from typer.exceptions import TyperException
 
 from common.errors import NoAnswerError, RefusedError, RunError, UsageError
 from common.messages import MessageError
-from common.telemetry import give_again
+from common.signals import give_again
 from deploy.cli import (
     bench,
     certs,

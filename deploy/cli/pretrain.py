@@ -13,7 +13,7 @@ from rich.table import Table
 
 from common.config import Config, Objective
 from common.link import Link
-from common.telemetry import exit_on_signals
+from common.signals import exit_on_signals
 from deploy.cli import options
 from deploy.launcher import free_port
 

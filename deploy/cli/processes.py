@@ -21,7 +21,8 @@ from common.errors import UsageError
 from common.files import lock
 from common.link import open_client, open_hub, open_router
 from common.resources import give_way, one_torch_thread
-from common.telemetry import exit_on_signals, start_logging, stop_on_signals
+from common.signals import exit_on_signals, signals_held, stop_on_signals
+from common.telemetry import start_logging
 from deploy.cli import options
 
 log = logging.getLogger("navaclq")
@@ -160,7 +161,8 @@ def _start_many(count: int, base: str | None) -> None:
     try:
         for i in range(count):
             named = ["--name", f"{base}.{i}"] if base else []
-            children.append(subprocess.Popen([*command, *named], process_group=0))
+            with signals_held():
+                children.append(subprocess.Popen([*command, *named], process_group=0))
         while any(child.poll() is None for child in children):
             time.sleep(0.2)
     finally:

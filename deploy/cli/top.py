@@ -16,7 +16,7 @@ from common.bus import Keys, ask_later, list_members
 from common.link import Link, open_client
 from common.members import Members
 from common.messages import ContractReply, MessageError, Nothing, decode, encode
-from common.telemetry import exit_on_signals
+from common.signals import exit_on_signals
 from deploy.cli import options
 from deploy.screen import Census, Screen, picture
 from deploy.troubles import Process, find_troubles

@@ -21,7 +21,7 @@ from common.link import make_link, open_client
 from common.members import Members
 from common.messages import ContractReply
 from common.resources import learner_threads
-from common.telemetry import exit_on_signals
+from common.signals import exit_on_signals
 from deploy.cli import options
 from deploy.cli.evaluate import drive
 from deploy.launcher import Child, Supervisor, free_port
