@@ -378,3 +378,24 @@ def test_command_prints_one_json_object_with_the_keys_that_programs_read(endpoin
         names = {"distance", "agent_clearance", "goal_clearance", "relative_angle"}
         assert names <= task["properties"].keys()
         assert len(task["robot"]) == len(task["dolly"]) == 3
+
+
+def test_json_of_tasks_of_another_environment_keeps_their_numbers_apart_and_can_be_scored(
+    endpoint, hub, started, tmp_path
+):
+    names = ("f", "mu", "x")
+    parameters = ",".join(f'{{name="{name}", low=5.0, high=8.0, easy=5.0}}' for name in names)
+    started(small_config(f"curriculum.parameters=[{parameters}]", "curriculum.gate.enabled=false"))
+    command = ["curriculum", "query", "--connect", endpoint, "--cell", "0", "--count", "3", "--json"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    for task in json.loads(result.stdout)["tasks"]:
+        assert task["task"].keys() == set(names)
+        assert all(5 <= value <= 8 for value in task["task"].values())
+        assert task["q"] is None
+        assert 0 <= task["f"] <= 1
+    file = tmp_path / "tasks.json"
+    file.write_text(result.stdout)
+    scored = CliRunner().invoke(app, ["curriculum", "score", str(file), "--connect", endpoint, "--json"])
+    assert scored.exit_code == 0, scored.output
+    assert len(json.loads(scored.stdout)["f"]) == 3

@@ -18,6 +18,8 @@ def run() -> None:
         run_command()
     except SystemExit as end:
         end_process(end.code if isinstance(end.code, int) else 0)
+    except KeyboardInterrupt:  # just before the command heeds it
+        end_process(130)
     except BaseException:
         traceback.print_exc()
         end_process(1)

@@ -19,7 +19,7 @@ from common.cells import check_cell
 from common.errors import UsageError
 from common.files import write_atomically
 from common.link import Link, open_client, open_hub
-from common.messages import Nothing, Proposals, ScoreQuery, Scores, Snapshot, TaskQuery
+from common.messages import Nothing, Proposal, Proposals, ScoreQuery, Scores, Snapshot, TaskQuery
 from common.resources import one_torch_thread
 from common.signals import exit_on_signals
 from common.tasks import Task
@@ -116,8 +116,7 @@ def query(
         question = TaskQuery(cell=cell, t=t, count=count)
         answer = ask(session, Keys("*").task, question, Proposals, timeout, patience=timeout)
     if as_json:
-        tasks = [p.model_dump() for p in answer.tasks]
-        options.print_json({"tasks": [{**task.pop("task"), **task} for task in tasks]})
+        options.print_json({"tasks": [_flat(proposal) for proposal in answer.tasks]})
         return
     table = Table("task", "requested", "category", "distance m", "angle deg", "Q", "f", "mu", "sigma")
     for p in answer.tasks:
@@ -128,6 +127,12 @@ def query(
     Console().print(table)
     for number, p in enumerate(answer.tasks, 1):
         Console().print(f"{number}: {p.why}")
+
+
+def _flat(proposal: Proposal) -> dict[str, Any]:
+    """A docking task's fields stand beside the proposal's; another environment's names might be the same."""
+    values = proposal.model_dump()
+    return {**values.pop("task"), **values} if isinstance(proposal.task, Task) else values
 
 
 def _name(task: Task | dict[str, float]) -> str:
