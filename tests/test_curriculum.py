@@ -333,6 +333,19 @@ def test_q_is_kept_until_weights_of_another_version_come():
     assert curriculum.propose(0, 0).q_version == "2.0"
 
 
+def test_oldest_q_is_renewed_first_in_whatever_cell_it_is():
+    curriculum, _ = with_candidates(PLUS, 2)
+    add(curriculum, *(make_candidate(PLUS, seed, 5) for seed in (2, 3)), seq=1)
+    learner = Learner(PLUS)
+    value(curriculum, learner, Version(epoch=1, counter=1))
+    curriculum.load_critic(Version(epoch=1, counter=2), learner.tensors())
+    curriculum.refresh(curriculum.cells[0], curriculum.stale(5)[0][1], nullcontext())
+    add(curriculum, make_candidate(PLUS, 4, 8), seq=2)
+    curriculum.load_critic(Version(epoch=1, counter=3), learner.tensors())
+    order = [curriculum.cells.index(cell) for cell, _ in curriculum.stale(5)]
+    assert order == [8, 5, 0], "none, then of the first weights, then of the second"
+
+
 @pytest.mark.parametrize("moment", [1, 2, 3])
 def test_candidate_that_leaves_while_its_q_is_computed_takes_no_others_place(file, moment):
     config, learner = PLUS, Learner(PLUS)

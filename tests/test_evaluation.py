@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 
@@ -39,6 +40,7 @@ from common.messages import ENDINGS
 from common.tasks import PlacedStart, Task
 from common.world_config import StartRanges
 from deploy.cli.evaluate import check_pairs, find_subject
+from tests.helpers import wait_until
 from tests.test_cli import call
 from tests.test_rollout import SMOKE, networks, save
 
@@ -336,6 +338,20 @@ def test_a_worker_that_dies_ends_the_evaluation_and_keeps_what_was_driven(tmp_pa
     with pytest.raises(RunError, match="a worker process of the evaluation died; what was driven is kept"):
         examine(Rival("b0", CONFIG), tasks, 1, Terms(max_steps=5), kill, work)
     assert list(work.load()) == list(range(22))
+
+
+def test_a_worker_that_dies_while_it_still_loads_ends_the_evaluation_too():
+    """Its networks are more than a pipe holds."""
+
+    def kill():
+        child = wait_until(multiprocessing.active_children)[0]
+        os.kill(child.pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(RunError, match="a worker process of the evaluation died"):
+        examine(find_subject("shipped", CONFIG), suite("short").tasks[:22], 1)
+    killer.join()
 
 
 def test_an_impossible_task_is_one_sentence_also_from_a_worker():

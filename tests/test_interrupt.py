@@ -30,7 +30,7 @@ COMMANDS = {
     "top that waits": ("top", "--connect", "{hub}"),
     "train": ("train", "--run", "{run}", *SMOKE),
     "pretrain": ("pretrain", "--run", "{run}", "--preset", "smoke"),
-    "evaluate": ("evaluate", "b0", "--suite", "train", "--work", "{run}.db"),
+    "evaluate": ("evaluate", "shipped", "--suite", "train", "--work", "{run}.db"),
     "world check": ("world", "check", "--tasks", "10000"),
     "bench sim": ("bench", "sim", "--rounds", "50"),
     "bench learner": ("bench", "learner"),

@@ -153,9 +153,10 @@ Piece = tuple[int, Sequence[Task]]
 """Number of the first task, and tasks that drive side by side."""
 
 
-def _work(pipe: Connection, subject: Subject, terms: Terms) -> None:
-    """A worker process: drives each piece that comes, until its parent has gone."""
+def _work(pipe: Connection) -> None:
+    """A worker process: told subject and terms, drives each piece that comes, until its parent has gone."""
     try:
+        subject, terms = pipe.recv()
         examiner = Examiner(subject, terms)
         while True:
             first, tasks = pipe.recv()
@@ -179,29 +180,30 @@ def _drive(
     try:
         for _ in range(min(processes, len(pieces))):
             ours, theirs = context.Pipe()
-            worker = context.Process(target=_work, args=(theirs, subject, terms), daemon=True)
+            worker = context.Process(target=_work, args=(theirs,), daemon=True)
             with workers_start():
                 worker.start()
                 workers.append(worker)
             theirs.close()
-            ours.send(waiting.pop())
             busy.append(ours)
+        for pipe in busy:  # networks as arguments would hold a worker's start up until it has loaded torch
+            pipe.send((subject, terms))
+            pipe.send(waiting.pop())
         while busy:
-            for pipe in wait(busy):
-                assert isinstance(pipe, Connection)
-                try:
-                    first, found = pipe.recv()
-                except (EOFError, OSError):
-                    raise RunError(
-                        "a worker process of the evaluation died; what was driven is kept, run it again"
-                    ) from None
+            for ready in wait(busy):
+                assert isinstance(ready, Connection)
+                first, found = ready.recv()
                 if isinstance(found, UsageError):
                     raise found
                 if waiting:
-                    pipe.send(waiting.pop())
+                    ready.send(waiting.pop())
                 else:
-                    busy.remove(pipe)
+                    busy.remove(ready)
                 yield first, found
+    except (EOFError, OSError):
+        raise RunError(
+            "a worker process of the evaluation died; what was driven is kept, run it again"
+        ) from None
     finally:
         for worker in workers:
             worker.terminate()
