@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -22,6 +23,7 @@ import zenoh
 from common.access import LOCAL, Credentials, access_control, explain_refusal
 from common.errors import NoAnswerError, UsageError
 from common.messages import MEGABYTE
+from common.signals import LEAVE
 
 log = logging.getLogger(__name__)
 LARGEST_MESSAGE = 320 * MEGABYTE
@@ -168,6 +170,8 @@ def _open(
 
 def end_process(code: int) -> NoReturn:
     """Flushes and exits at once: threads of Zenoh that still run may hold up the interpreter's own end."""
+    for number in LEAVE:
+        signal.signal(number, signal.SIG_DFL)
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # closed by whoever read it

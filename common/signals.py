@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -14,12 +16,34 @@ from types import FrameType
 LEAVE = (signal.SIGTERM, signal.SIGINT)
 
 
-def stop_on_signals() -> threading.Event:
-    """From now on SIGTERM and SIGINT set the event: for a loop that is to end between two of its rounds."""
-    stopping = threading.Event()
+class Stop:
+    """Whether a signal has come. A threading.Event that is set by a handler may wait for itself for ever."""
+
+    def __init__(self) -> None:
+        self._came = False
+
+    def set(self, *_: object) -> None:
+        """A signal has come."""
+        self._came = True
+
+    def is_set(self) -> bool:
+        """Whether one has come."""
+        return self._came
+
+    def wait(self, seconds: float = math.inf) -> bool:
+        """Sleeps so long, or until one comes; whether one has."""
+        until = time.monotonic() + seconds
+        while not self._came and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, 0.05))  # which goes on after a handler
+        return self._came
+
+
+def stop_on_signals() -> Stop:
+    """From now on SIGTERM and SIGINT only take note: for a loop that is to end between two of its rounds."""
+    stop = Stop()
     for number in LEAVE:
-        signal.signal(number, lambda *_: stopping.set())
-    return stopping
+        signal.signal(number, stop.set)
+    return stop
 
 
 def exit_on_signals() -> None:
@@ -43,7 +67,7 @@ def exit_on_signals() -> None:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """SIGTERM and SIGINT wait while a child is started: its parent then knows it, and ends it."""
+    """SIGTERM and SIGINT wait, in the main thread: a child that is started is known, or all are ended."""
     came: list[int] = []
     before = {number: signal.getsignal(number) for number in LEAVE}
     try:

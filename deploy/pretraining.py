@@ -23,6 +23,7 @@ from common.frames import FrameTable
 from common.link import Link, open_hub
 from common.networks import compile_encoder, export_onnx, load_state, make_encoder, state_of
 from common.policy_files import CONFIG, load_tensors, save_folder
+from common.signals import signals_held
 from deploy.launcher import Child, Supervisor
 from learner.pretraining.frame_store import FrameStore
 from learner.pretraining.objectives import Pretraining
@@ -74,7 +75,8 @@ def gather(
             finally:
                 receiver.close()
     finally:
-        supervisor.stop()
+        with signals_held():
+            supervisor.stop()
         store.close()
     store.seal()
     shutil.rmtree(spool, ignore_errors=True)

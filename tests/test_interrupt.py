@@ -34,6 +34,7 @@ COMMANDS = {
     "world check": ("world", "check", "--tasks", "10000"),
     "bench sim": ("bench", "sim", "--rounds", "50"),
     "bench learner": ("bench", "learner"),
+    "bench curriculum": ("bench", "curriculum"),
     "doctor": ("doctor", "--connect", "{hub}"),
 }
 

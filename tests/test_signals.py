@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from common.signals import LEAVE, signals_held
-from tests.helpers import heed_ctrl_c
+from tests.helpers import PATIENCE, heed_ctrl_c
 
 SCRIPT = """
 import sys, time
@@ -32,7 +32,7 @@ def test_a_signal_ends_a_process_cleanly_with_its_session_closed(endpoint, numbe
     assert process.stdout is not None
     assert process.stdout.readline() == b"up\n"
     process.send_signal(number)
-    rest, _ = process.communicate(timeout=20)
+    rest, _ = process.communicate(timeout=20 * PATIENCE)
     assert rest == b"closed\n"
     assert process.returncode == 0
 
@@ -65,13 +65,31 @@ def test_a_signal_that_comes_where_python_ignores_exceptions_is_not_lost():
 
     def run(script):
         command, folder = [sys.executable, "-c", script], Path(__file__).parents[1]
-        found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25)
+        found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25 * PATIENCE)
         return found.returncode, found.stdout, found.stderr
 
     assert run(IN_A_CALLBACK) == (0, b"ignored\nclosed\n", b"")
     code, out, err = run(IN_A_CALLBACK.replace("exit_on_signals()", BEFORE))
     assert (code, out) == (-signal.SIGINT, b"ignored\nclosed\n")
     assert err.endswith(b"KeyboardInterrupt\n")
+
+
+SLEEPS = """
+import signal, threading, time
+from common.signals import stop_on_signals
+stop = stop_on_signals()
+began = time.monotonic()
+assert not stop.wait(0.2) and not stop.is_set()
+assert time.monotonic() - began >= 0.2
+threading.Timer(0.2, signal.raise_signal, [signal.SIGTERM]).start()
+print(stop.wait(), stop.is_set(), stop.wait(1000))
+"""
+
+
+def test_a_loop_that_sleeps_is_told_of_a_signal():
+    command, folder = [sys.executable, "-c", SLEEPS], Path(__file__).parents[1]
+    found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25 * PATIENCE)
+    assert (found.returncode, found.stdout, found.stderr) == (0, b"True True True\n", b"")
 
 
 STARTS = """
@@ -95,7 +113,7 @@ finally:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_waits_until_a_child_that_is_being_started_is_known_to_its_parent(number):
     command, folder = [sys.executable, "-c", STARTS, str(int(number))], Path(__file__).parents[1]
-    found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25)
+    found = subprocess.run(command, capture_output=True, cwd=folder, timeout=25 * PATIENCE)
     assert (found.returncode, found.stdout, found.stderr) == (0, b"ended -9\n", b"")
 
 
@@ -135,6 +153,7 @@ if __name__ == "__main__":
     try:
         with workers_start():
             worker.start()
+            theirs.close()
             os.killpg(0, signal.SIGINT)  # as a terminal does, while the worker still loads Python
     except KeyboardInterrupt:
         print("interrupted", signal.pthread_sigmask(signal.SIG_BLOCK, ()), ours.recv(), flush=True)
@@ -151,7 +170,7 @@ def test_ctrl_c_is_for_the_parent_alone_from_a_workers_first_moment_on(tmp_path)
         [sys.executable, str(script)],
         capture_output=True,
         text=True,
-        timeout=25,
+        timeout=25 * PATIENCE,
         start_new_session=True,
         preexec_fn=heed_ctrl_c,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},

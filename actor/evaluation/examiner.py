@@ -186,24 +186,25 @@ def _drive(
                 workers.append(worker)
             theirs.close()
             busy.append(ours)
-        for pipe in busy:  # networks as arguments would hold a worker's start up until it has loaded torch
-            pipe.send((subject, terms))
-            pipe.send(waiting.pop())
-        while busy:
-            for ready in wait(busy):
-                assert isinstance(ready, Connection)
-                first, found = ready.recv()
-                if isinstance(found, UsageError):
-                    raise found
-                if waiting:
-                    ready.send(waiting.pop())
-                else:
-                    busy.remove(ready)
-                yield first, found
-    except (EOFError, OSError):
-        raise RunError(
-            "a worker process of the evaluation died; what was driven is kept, run it again"
-        ) from None
+        try:
+            for pipe in busy:
+                pipe.send((subject, terms))  # as arguments they would hold up the start until torch is loaded
+                pipe.send(waiting.pop())
+            while busy:
+                for ready in wait(busy):
+                    assert isinstance(ready, Connection)
+                    first, found = ready.recv()
+                    if isinstance(found, UsageError):
+                        raise found
+                    if waiting:
+                        ready.send(waiting.pop())
+                    else:
+                        busy.remove(ready)
+                    yield first, found
+        except (EOFError, OSError):
+            raise RunError(
+                "a worker process of the evaluation died; what was driven is kept, run it again"
+            ) from None
     finally:
         for worker in workers:
             worker.terminate()

@@ -20,16 +20,17 @@ PATIENCE = 60.0
 def running(name: str, command: list[str], log_file: Path) -> Iterator[Child]:
     """A command of navaclq, ended by SIGTERM; raises RunError when it fails then."""
     child = Child(name, lambda: command, log_file)
-    child.start()
-    assert child.process is not None
     try:
+        child.start()
         yield child
+        assert child.process is not None
         child.process.terminate()
         if child.process.wait(PATIENCE):
             raise RunError(f"the {name} failed: {child.last_words()}")
     finally:
-        child.process.kill()
-        child.process.wait()
+        if child.process:
+            child.process.kill()
+            child.process.wait()
 
 
 def look_after(child: Child) -> Callable[[float], None]:

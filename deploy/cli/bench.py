@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +19,7 @@ app = typer.Typer(help="Measure parts against their rivals and limits.", no_args
 @app.callback()
 def _group() -> None:
     """Measure parts against their rivals and limits, all in one run; ratios, higher is better."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # its processes end with it, as by Ctrl-C
 
 
 @app.command()

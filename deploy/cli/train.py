@@ -21,7 +21,7 @@ from common.link import make_link, open_client
 from common.members import Members
 from common.messages import ContractReply
 from common.resources import learner_threads
-from common.signals import exit_on_signals
+from common.signals import exit_on_signals, signals_held
 from deploy.cli import options
 from deploy.cli.evaluate import drive
 from deploy.launcher import Child, Supervisor, free_port
@@ -132,9 +132,10 @@ def _supervise(
                 time.sleep(0.2)
         return os.getloadavg()[0]
     finally:
-        if screen:
-            screen.close()
-        supervisor.stop()
+        with signals_held():
+            if screen:
+                screen.close()
+            supervisor.stop()
 
 
 def _describe_encoder(contract: ContractReply) -> str:
