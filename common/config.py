@@ -100,8 +100,6 @@ class SacConfig(Section):
     """Updates between hard copies."""
     policy_delay: Count = 2
     """Critic updates per policy and temperature update."""
-    policy_average: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Decay, per policy update, of the mean of its weights that snapshots hold; 0: the last weights."""
     initial_alpha: Positive = 0.1
     """The paper's 0.2 takes minutes to decay; until then the noise alone makes most dockings fail."""
     alpha_floor: Annotated[float, Field(ge=0)] = 0.02

@@ -99,10 +99,6 @@ class SAC:
         }
         if config.encoder.end_to_end:
             self._modules["target_perception"] = self.target_perception
-        self.average = self.policy
-        if config.sac.policy_average:
-            self.average = copy.deepcopy(self.policy).requires_grad_(False)
-            self._modules["average"] = self.average
         self._end_to_end = config.encoder.end_to_end
         self._online: list[Tensor] = [*self.critic.parameters(), *self.perception.parameters()]
         self._targets: list[Tensor] = [*self.target.parameters(), *self.target_perception.parameters()]
@@ -163,8 +159,6 @@ class SAC:
                     embedded = self.critic.net.embed(flat)
             policy, entropy = self._descend_policy(flat.detach(), embedded.detach())
         self.optimizer.step()
-        if self.policy_due:
-            self._update_average()
         self.updates += 1
         self._bound_temperature()
         self._update_targets()
@@ -187,12 +181,6 @@ class SAC:
             with torch.no_grad():
                 self.log_alpha.clamp_(min=math.log(self.config.sac.alpha_floor))
 
-    def _update_average(self) -> None:
-        if self.average is not self.policy:
-            with torch.no_grad():
-                weight = 1 - self.config.sac.policy_average
-                torch._foreach_lerp_(list(self.average.parameters()), self._learned["policy"], weight)
-
     def _update_targets(self) -> None:
         sac = self.config.sac
         with torch.no_grad():
@@ -214,10 +202,6 @@ class SAC:
         """What an actor needs."""
         return state_of(perception=self.perception, policy=self.policy)
 
-    def snapshot_state(self) -> dict[str, Tensor]:
-        """What a snapshot keeps for an actor: the same, the policy's weights averaged if they are."""
-        return state_of(perception=self.perception, policy=self.average)
-
     def critic_state(self) -> dict[str, Tensor]:
         """What Q(s0, a0) needs: the target critics to the letter (alg. 2), else the current ones."""
         critic = self.target if self.config.curriculum.algorithm == "navacl-q" else self.critic
@@ -233,12 +217,7 @@ class SAC:
 
     def load_weights(self, networks: dict[str, Tensor]) -> None:
         """The networks alone; raises ValueError naming the first tensor that does not fit."""
-        modules = dict(self._modules)
-        average = modules.pop("average", None)
-        load_state(networks, **modules)
-        if average is not None:  # a run that kept none begins with the policy
-            kept = any(name.startswith("average.") for name in networks)
-            load_state(networks if kept else state_of(average=self.policy), average=average)
+        load_state(networks, **self._modules)
 
     def load(self, networks: dict[str, Tensor], moments: dict[str, Tensor], updates: int) -> None:
         """Takes what `state` gave; raises ValueError naming the first tensor that does not fit."""

@@ -361,7 +361,7 @@ class LearnerService:
         return self.contract
 
     def _snapshot(self, name: str, **figures: float) -> None:
-        networks = self.learner.sac.snapshot_state() | self._frozen
+        networks = self.learner.sac.policy_state() | self._frozen
         state = {"updates": self.updates, "env_steps": self._log.env_steps, **figures}
         self.run_directory.snapshot(name, networks, state)
 

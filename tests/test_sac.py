@@ -336,7 +336,6 @@ def test_normaliser_sees_one_batch_in_ten_and_equals_mean_and_variance_of_all_it
 
 
 CASES: dict[str, Callable[[], Config]] = {
-    "averaged": lambda: small_config("sac.policy_average=0.9"),
     "smoke": lambda: small_config("sac.tau=0.1", NORMALIZED),
     "paper": lambda: resolve("paper", overrides=PAPER),
     "end to end": lambda: small_config(
@@ -496,40 +495,3 @@ def test_preset_updates_with_finite_figures_at_full_size(preset):
     key = "critic.net.fusion.weights.0"
     for twin in range(2):
         assert not torch.equal(before[key][twin], after[key][twin])
-
-
-def test_snapshots_hold_the_mean_of_the_policy_that_decays_with_each_of_its_updates():
-    config = small_config("sac.policy_average=0.75", "sac.policy_delay=2", "sac.learning_rate=0.01")
-    sac = SAC(config)
-    mean = values_of(sac.policy)
-    for seed in range(5):
-        due = sac.policy_due
-        sac.update(make_batch(config, seed=seed))
-        if due:
-            mean = [0.75 * old + 0.25 * new for old, new in zip(mean, values_of(sac.policy), strict=True)]
-    kept = Policy(ObservationLayout.of(config), config.network)
-    load_state(sac.snapshot_state(), policy=kept, perception=sac.perception)
-    for ours, expected in zip(values_of(kept), mean, strict=True):
-        torch.testing.assert_close(ours, expected)
-    assert not same(values_of(kept), values_of(sac.policy))
-    assert sac.snapshot_state().keys() == sac.policy_state().keys()
-
-
-def test_without_averaging_snapshots_hold_the_policy_itself():
-    config = small_config("sac.policy_average=0")
-    sac = SAC(config)
-    sac.update(make_batch(config))
-    ours, theirs = sac.snapshot_state(), sac.policy_state()
-    assert ours.keys() == theirs.keys()
-    assert all(torch.equal(value, theirs[key]) for key, value in ours.items())
-
-
-def test_run_that_kept_no_average_goes_on_with_one_that_begins_at_its_policy():
-    before, now = small_config("sac.policy_average=0"), small_config("sac.policy_average=0.9")
-    source, fresh = SAC(before), SAC(now)
-    source.update(make_batch(before))
-    fresh.load(*source.state(), source.updates)
-    assert same(values_of(fresh.average), values_of(source.policy))
-    fresh.update(make_batch(now))
-    fresh.update(make_batch(now))
-    assert not same(values_of(fresh.average), values_of(fresh.policy))
