@@ -30,7 +30,7 @@ from common.delivery import (
 from common.errors import RefusedError
 from common.link import make_link, open_client, open_hub
 from common.messages import BUNDLE, Frames, MessageError, Origin, Receipt, TaskQuery, decode, encode
-from tests.helpers import STORED, deliver, deliver_all, parcel, reason, wait_until
+from tests.helpers import PATIENCE, STORED, deliver, deliver_all, parcel, reason, wait_until
 
 KEY = "navaclq/run-1/trajectory"
 OTHER = "navaclq/run-1/frames"
@@ -451,7 +451,7 @@ def test_busy_receiver_is_asked_again_until_it_has_room(hub, client, spool):
 
     def handler(*_: object) -> bytes:
         entered.set()
-        assert opened.wait(20)
+        assert opened.wait(20 * PATIENCE)
         return encode(STORED)
 
     server = QueryServer(hub, f"{KEY}/*/*", handler, capacity=1)
@@ -459,12 +459,15 @@ def test_busy_receiver_is_asked_again_until_it_has_room(hub, client, spool):
         Sender(client, Spool(spool.folder / str(i), MEGABYTE), Member("actor", "local", f"r{i}"), "b1")
         for i in range(3)
     ]
-    for rival in rivals:
-        rival.put(KEY, TaskQuery(cell=0))
-    assert entered.wait(10)
+    rivals[0].put(KEY, TaskQuery(cell=0))
+    assert entered.wait(10 * PATIENCE)
+    rivals[1].put(KEY, TaskQuery(cell=0))
+    wait_until(lambda: len(server) == 1)
+    rivals[2].put(KEY, TaskQuery(cell=0))
     # one is being handled, one waits behind it, and there is no room for the third
-    wait_until(lambda: [rival.held_back for rival in rivals].count(True) == 1)
-    assert sorted(rival.trouble for rival in rivals) == ["", "", BUSY]
+    wait_until(lambda: rivals[2].held_back)
+    assert [rival.trouble for rival in rivals] == ["", "", BUSY]
+    assert [rival.held_back for rival in rivals] == [False, False, True]
     assert [rival.sent for rival in rivals] == [0, 0, 0]
     opened.set()
     assert [rival.close(patience=15) for rival in rivals] == [0, 0, 0]
