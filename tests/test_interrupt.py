@@ -64,8 +64,8 @@ def mark() -> Iterator[str]:
             continue
 
 
-def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
-    """Ctrl-C so many seconds after the start."""
+def interrupt(name: str, moment: float, folder: Path, mark: str, number: int = signal.SIGINT) -> None:
+    """Ctrl-C, or another signal, so many seconds after the start."""
     words = {"run": folder / uuid.uuid4().hex, "hub": free_endpoint(), "own": free_endpoint()}
     output = folder / "output.txt"
     with output.open("wb") as file:
@@ -81,11 +81,11 @@ def interrupt(name: str, moment: float, folder: Path, mark: str) -> None:
     time.sleep(moment)
     early, began = process.poll(), time.monotonic()
     if early is None:
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all that have not left its group
+        os.killpg(process.pid, number)  # as a terminal does: to all that have not left its group
         time.sleep(0.5)
         if b"Exception ignored" in output.read_bytes():
             # the interpreter loses it in its own imports, before any of our lines runs; people press it again
-            os.killpg(process.pid, signal.SIGINT)
+            os.killpg(process.pid, number)
     try:
         process.wait(began + SOON * PATIENCE - time.monotonic())
     except subprocess.TimeoutExpired:
@@ -107,6 +107,11 @@ def test_ctrl_c_ends_a_command_and_all_its_processes(name, tmp_path, mark):
     dice = random.Random(name)
     for moment in (dice.uniform(0.0, 0.8), dice.uniform(0.8, 5.0)):
         interrupt(name, moment, tmp_path, mark)
+
+
+def test_sigterm_ends_a_benchmark_and_all_its_processes(tmp_path, mark):
+    for moment in (2.0, 4.0, 6.0):  # within these its learner is started, and waited for
+        interrupt("bench curriculum", moment, tmp_path, mark, signal.SIGTERM)
 
 
 @pytest.mark.slow

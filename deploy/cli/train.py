@@ -133,9 +133,11 @@ def _supervise(
         return os.getloadavg()[0]
     finally:
         with signals_held():
-            if screen:
-                screen.close()
-            supervisor.stop()
+            try:
+                if screen:
+                    screen.close()
+            finally:
+                supervisor.stop()
 
 
 def _describe_encoder(contract: ContractReply) -> str:
